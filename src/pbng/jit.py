@@ -1,0 +1,109 @@
+"""How pbng compiles: flags, inlined helpers, cached kernels and kernels specialised to the materials of a problem.
+
+Numba caches a compiled kernel on disk, but its cache has two gaps that matter here: it does not notice a change in a
+function that the kernel calls from another file, and it never hits when a kernel receives or closes over another
+compiled function. Both are closed by giving a kernel one string in place of functions: a *key* that names what to call
+and carries a fingerprint of everything reachable. A string in a closure is part of Numba's cache index and a literal
+type at compile time, so that :func:`pbng.dispatch.call_row` can find the functions by it.
+"""
+
+import hashlib
+import logging
+import time
+import types
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit
+from numba.core import event
+
+log = logging.getLogger("pbng")
+
+# Reassociation and contraction let LLVM vectorise sums; NaN and infinity keep their meaning (no "nnan", "ninf").
+FLAGS: dict[str, Any] = {
+    "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
+    "error_model": "numpy",
+}
+
+inline = njit(forceinline=True, **FLAGS)  # a helper that vanishes into the kernel that calls it
+kernel = njit(parallel=True, cache=True, **FLAGS)  # a module-level parallel loop, cached on disk
+serial = njit(cache=True, error_model="numpy")  # a module-level serial loop, cached on disk
+
+
+def fingerprint(*functions: Callable[..., Any]) -> str:
+    """Hash of the byte code and constants of functions and of everything of pbng's or the user's that they call."""
+    digest = hashlib.sha256()
+    seen: set[int] = set()
+    for function in functions:
+        _feed(digest, function, seen)
+    return digest.hexdigest()[:16]
+
+
+def _feed(digest: Any, value: Any, seen: set[int]) -> None:
+    value = getattr(value, "py_func", value)
+    if isinstance(value, types.FunctionType):
+        if id(value) in seen or (value.__module__ or "").partition(".")[0] in ("numba", "numpy", "math"):
+            return
+        seen.add(id(value))
+        _feed(digest, value.__code__, seen)
+        for name in sorted(_names(value.__code__)):
+            if name in value.__globals__:
+                _feed(digest, value.__globals__[name], seen)
+        for cell in value.__closure__ or ():
+            _feed(digest, cell.cell_contents, seen)
+    elif isinstance(value, types.CodeType):
+        digest.update(value.co_code)
+        digest.update(repr(value.co_names).encode())
+        for constant in value.co_consts:
+            _feed(digest, constant, seen)
+    elif isinstance(value, tuple):
+        for item in value:
+            _feed(digest, item, seen)
+    elif isinstance(value, bool | int | float | complex | str | bytes | type(None) | frozenset):
+        digest.update(repr(sorted(value, key=repr) if isinstance(value, frozenset) else value).encode())
+    # Modules, classes and NumPy scalars types are named by the code that uses them.
+
+
+def _names(code: types.CodeType) -> set[str]:
+    names = set(code.co_names)
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            names |= _names(constant)
+    return names
+
+
+class _Announcer(event.Listener):
+    """Logs when pbng kernels are really compiled (a load from the cache raises no event), with the time it took."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.announced = False
+        self.start = 0.0
+        self.seconds = 0.0
+
+    def on_start(self, event: Any) -> None:
+        if self.depth == 0:
+            self.start = time.perf_counter()
+            if not self.announced and _is_kernel(event):
+                log.warning("pbng: compiling kernels (once; the result is cached) ...")
+                self.announced = True
+        self.depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self.depth -= 1
+        if self.depth == 0:
+            self.seconds += time.perf_counter() - self.start
+
+
+def _is_kernel(event: Any) -> bool:
+    function = getattr(event.data.get("dispatcher"), "py_func", None)
+    return getattr(function, "__module__", "").startswith("pbng")
+
+
+_announcer = _Announcer()
+event.register("numba:compile", _announcer)
+
+
+def compile_seconds() -> float:
+    """Seconds [s] that this process has spent compiling kernels so far."""
+    return _announcer.seconds
