@@ -112,7 +112,10 @@ class Mesh:
         """Points (n, 3) [m] and triangles (m, 3) that stand for the mesh at x (n_vert, 3) in pictures and exports."""
         return x, self.surface
 
-    surface: np.ndarray
+    @cached_property
+    def surface(self) -> np.ndarray:
+        """Triangles (m, 3) int32 of the boundary of a solid, normals outward, or of the mesh itself if it is one."""
+        return self.cells
 
     def where(
         self,
@@ -267,11 +270,6 @@ class TriMesh(Mesh):
     def is_plane(self) -> bool:
         """Whether the mesh lies in a plane of constant z."""
         return bool(np.ptp(self.X[:, 2]) == 0)
-
-    @property
-    def surface(self) -> np.ndarray:
-        """The triangles themselves (n_elem, 3): what is drawn and exported."""
-        return self.cells
 
     @cached_property
     def volume(self) -> np.ndarray:
