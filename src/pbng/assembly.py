@@ -1,0 +1,171 @@
+"""Energy and forces of all elements in float64: the certificate every method shares.
+
+Elements are laid out in blocks of W of one group (lanes, see :mod:`pbng.elements.base`). Shape gradients are recomputed
+from the rest positions, which costs less than to read them. Forces go to a buffer, a place a corner, from which each
+node then sums its own: no atomics, and the same bits for any number of threads.
+"""
+
+import numpy as np
+from numba import njit, prange, uint64
+
+from pbng.coloring import morton
+from pbng.dispatch import Term, specialised, term_energy, term_forces
+from pbng.elements.base import W
+from pbng.jit import FLAGS, kernel, serial
+
+CHUNK = 64  # blocks a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
+SCRATCH = 9 * 4 * W
+
+
+class Evaluation:
+    """What one pass over the elements finds: ``energy`` [J], ``force_scale`` [N] and ``inverted`` elements."""
+
+    __slots__ = ("energy", "force_scale", "inverted")
+
+    def __init__(self, energy: float, force_scale: float, inverted: int) -> None:
+        self.energy, self.force_scale, self.inverted = energy, force_scale, inverted
+
+
+class ElementBlocks:
+    """Element groups laid out for evaluation, for any numbering of the vertices.
+
+    Args:
+        groups: The element groups (:class:`pbng.problem.ElementGroup`).
+        X: Rest positions [m], (n_vert, 3).
+        slot: Number of each vertex in the arrays that will be evaluated, (n_vert,); by default its own.
+        n_slot: Length of those arrays.
+    """
+
+    def __init__(self, groups, X: np.ndarray, slot: np.ndarray | None = None, n_slot: int | None = None) -> None:
+        slot = np.arange(len(X)) if slot is None else slot
+        self.n_slot = len(X) if n_slot is None else n_slot
+        self.X = np.zeros((self.n_slot, 4))
+        self.X[slot, :3] = X
+        self.X = self.X.ravel()
+        self.terms = tuple(dict.fromkeys(g.term for g in groups))
+        self.parameters, first = group_parameters(groups, np.float64)
+        idx, blocks, at = [], [], 0
+        for number, group in enumerate(groups):
+            cells = slot[group.cells][:, group.term.kind.order].astype(np.uint32)
+            cells = cells[np.argsort(morton(X[group.cells].mean(1)), kind="stable")]
+            n, corners = cells.shape
+            n_block = -(-n // W)
+            padded = np.concatenate([cells, np.repeat(cells[-1:], n_block * W - n, axis=0)])
+            idx.append(padded.reshape(n_block, W, corners).transpose(0, 2, 1).ravel())
+            rows = np.empty((n_block, 4), np.int64)
+            rows[:, 0] = self.terms.index(group.term)
+            rows[:, 1] = first[number]
+            rows[:, 2] = at + np.arange(n_block) * (W * corners)
+            rows[:, 3] = np.minimum(W, n - np.arange(n_block) * W)
+            blocks.append(rows)
+            at += n_block * W * corners
+        self.idx, self.blocks = np.concatenate(idx), np.concatenate(blocks)
+        self._forces: np.ndarray | None = None
+        self._start = self._place = np.empty(0, np.int64)
+
+    def energy(self, x: np.ndarray) -> float:
+        """Elastic energy [J] at x, flat (4 n_slot,) with a zero fourth component, of either precision."""
+        return specialised(make_energy, self.terms)(x, self.X, self.blocks, self.idx, self.parameters)
+
+    def forces(self, x: np.ndarray, f: np.ndarray) -> Evaluation:
+        """Write the internal force of every node [N] to f (4 n_slot,) float64; x as for :meth:`energy`."""
+        if self._forces is None:
+            self._forces = np.empty(3 * len(self.idx))
+            self._start, self._place = _places(self.blocks, self.idx, self.n_slot)
+        found = specialised(make_forces, self.terms)(x, self.X, self.blocks, self.idx, self.parameters, self._forces)
+        _gather(self._start, self._place, self._forces, f)
+        return Evaluation(float(found[0]), float(found[1]), int(found[2]))
+
+
+def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers kernels read: for each group b, then the model's parameters; and where each group's start."""
+    rows = []
+    for group in groups:
+        block = group.block(paper_block)
+        rows.append([0.0 if block.at_rest else block.b, *group.material.parameters()])
+    first = np.cumsum([0] + [len(r) for r in rows])[:-1]
+    return np.array([v for r in rows for v in r], dtype), first
+
+
+def make_energy(key: str):
+    """Kernel of :meth:`ElementBlocks.energy`."""
+
+    @njit(parallel=True, cache=True, **FLAGS)
+    def energy(x, X, blocks, idx, par):
+        n = blocks.shape[0]
+        part = np.zeros((n + CHUNK - 1) // CHUNK)
+        for chunk in prange(part.size):
+            g = np.empty(SCRATCH)
+            total = 0.0
+            for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+                k, p, i, m = blocks[b]
+                total += term_energy(key, k, (m, uint64(i), x, X, idx, par, uint64(p), g))
+            part[chunk] = total
+        return part.sum()
+
+    return energy
+
+
+def make_forces(key: str):
+    """Kernel of :meth:`ElementBlocks.forces`."""
+
+    @njit(parallel=True, cache=True, **FLAGS)
+    def forces(x, X, blocks, idx, par, f):
+        n = blocks.shape[0]
+        part = np.zeros(((n + CHUNK - 1) // CHUNK, 3))
+        for chunk in prange(part.shape[0]):
+            g = np.empty(SCRATCH)
+            for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+                k, p, i, m = blocks[b]
+                e, s, inverted = term_forces(
+                    key, k, (m, uint64(i), x, X, idx, par, uint64(p), g, f, uint64(3) * uint64(i))
+                )
+                part[chunk, 0] += e
+                part[chunk, 1] += s
+                part[chunk, 2] += inverted
+        return part.sum(0)
+
+    return forces
+
+
+@serial
+def _places(blocks, idx, n_slot):
+    """Where in the force buffer the corners of each vertex are, in compressed rows (real elements only)."""
+    start = np.zeros(n_slot + 1, np.int64)
+    for b in range(blocks.shape[0]):
+        first, m = blocks[b, 2], blocks[b, 3]
+        end = blocks[b + 1, 2] if b + 1 < blocks.shape[0] else idx.size
+        for i in range(first, end):
+            if (i - first) % W < m:
+                start[idx[i] + 1] += 1
+    for v in range(n_slot):
+        start[v + 1] += start[v]
+    position = start[:-1].copy()
+    place = np.empty(start[-1], np.int64)
+    for b in range(blocks.shape[0]):
+        first, m = blocks[b, 2], blocks[b, 3]
+        end = blocks[b + 1, 2] if b + 1 < blocks.shape[0] else idx.size
+        for i in range(first, end):
+            lane = (i - first) % W
+            if lane < m:
+                v = idx[i]
+                place[position[v]] = 3 * first + (i - first) // W * (3 * W) + lane
+                position[v] += 1
+    return start, place
+
+
+@kernel
+def _gather(start, place, buffer, f):
+    n = start.size - 1
+    for chunk in prange((n + 1023) // 1024):
+        for v in range(chunk * 1024, min(n, (chunk + 1) * 1024)):
+            a, b, c = 0.0, 0.0, 0.0
+            for k in range(start[v], start[v + 1]):
+                o = place[k]
+                a += buffer[o]
+                b += buffer[o + W]
+                c += buffer[o + 2 * W]
+            f[4 * v] = a
+            f[4 * v + 1] = b
+            f[4 * v + 2] = c
+            f[4 * v + 3] = 0.0

@@ -1,0 +1,1 @@
+"""Element kinds: the stencils that the sweep knows, one file each."""

@@ -1,0 +1,89 @@
+"""What an element kind is: a stencil and four functions, each made for a material model and inlined into kernels.
+
+Kernels work on *lanes*: W nodes (or elements) side by side, which LLVM turns into vector instructions. Arrays are flat
+and indices unsigned, because run-time strides and sign checks keep it from doing so. A position is four numbers, the
+fourth zero: reading it too keeps the loads of a lane free of gaps.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+from numba import uint64
+
+from pbng.jit import inline
+from pbng.materials.base import Model
+
+W = 16  # lanes: float32 fills one AVX-512 register; float64 is as fast with 16 as with 8
+
+
+class ElementKind(ABC):
+    """An element kind; ``corners`` vertices, ``others`` of which one incidence of a node refers to besides it."""
+
+    name: ClassVar[str]
+    corners: ClassVar[int]
+    others: ClassVar[int]
+    opposite: ClassVar[np.ndarray]  # (corners, others): for each corner, the local numbers of the others, in order
+
+    @property
+    def order(self) -> list[int]:
+        """Order of a cell's corners in which ``energy`` and ``forces`` take them: others of the last, then the last."""
+        return [*self.opposite[-1].tolist(), self.corners - 1]
+
+    @abstractmethod
+    def width(self, model: Model) -> int:
+        """Coefficients stored for one incidence."""
+
+    @abstractmethod
+    def pack(self, model: Model) -> Any:
+        """``(X, cells, e, a, opposite, coef, at, block, nodal, to)``: write the coefficients of corner a of element e
+        to ``coef[at + W * j]`` and add the constant part of its Hessian to ``nodal[to + W * j]``."""
+
+    @abstractmethod
+    def sweep(self, model: Model) -> Any:
+        """``(n, i, c, x, idx, coef, par, p, g, acc)``: for n rows from ``idx[i]`` and ``coef[c]``, add forces and
+        Hessians of the W nodes of a block to ``acc``; the material's numbers start at ``par[p]``."""
+
+    @abstractmethod
+    def energy(self, model: Model) -> Any:
+        """``(m, i, x, X, idx, par, p, g)``: energy [J] of the first m of the W elements at ``idx[i]``."""
+
+    @abstractmethod
+    def forces(self, model: Model) -> Any:
+        """``(m, i, x, X, idx, par, p, g, f, o)``: the same, with forces on corners written to ``f[o]``; returns
+        the energy, the sum of the norms of the elements' forces [N] and the number of inverted elements."""
+
+    @abstractmethod
+    def fingerprint(self, model: Model) -> str:
+        """Hash of the code of the functions above."""
+
+
+@inline
+def vec(g, j):
+    """Vector at position j of a scratch array of 4-component vectors, the fourth zero."""
+    return g[j] + g[j + uint64(3)], g[j + uint64(1)], g[j + uint64(2)]
+
+
+@inline
+def gather(n, i, x, idx, g, to):
+    """Copy the n * W positions that ``idx[i:]`` names to ``g[to:]``."""
+    for l_ in range(n * W):
+        l = uint64(l_)
+        p = uint64(idx[i + l]) * uint64(4)
+        q = to + l * uint64(4)
+        a = x[p]
+        b = x[p + uint64(1)]
+        c = x[p + uint64(2)]
+        d = x[p + uint64(3)]
+        g[q] = a
+        g[q + uint64(1)] = b
+        g[q + uint64(2)] = c
+        g[q + uint64(3)] = d
+
+
+def parameters(n: int) -> Any:
+    """``(par, p) -> (par[p], ..., par[p + n - 1])``, as a tuple of scalars."""
+    if n == 0:
+        return inline(lambda par, p: ())
+    before, last = parameters(n - 1), uint64(n - 1)
+    return inline(lambda par, p: (*before(par, p), par[p + last]))

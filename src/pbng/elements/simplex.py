@@ -1,0 +1,286 @@
+"""Linear simplices with constant F: tetrahedra, and plane-strain triangles as tetrahedra with one edge along z.
+
+An incidence is a node x with the other corners p, q, r of one of its elements; a = q - p, b = r - p, e = x - p are its
+edges, ordered so that det [a b e] > 0 at rest. For an isotropic material the axes of the rest state may be turned
+freely, so they are turned for each incidence such that the gradient of x's shape function points along the third
+(the *node frame*): then only the third columns of P and of cof F enter the node's force and Hessian. Six numbers
+k give F = [a b e] K with K upper triangular, and a seventh is w = V |g|.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import uint64
+
+from pbng.elements.base import ElementKind, W, gather, parameters, vec
+from pbng.jit import fingerprint, inline
+from pbng.linalg import add, cofactor, combine, combine3, cross, det, dot, mat_vec, scale, sub
+from pbng.materials.base import Model
+
+NODE_FRAME, REST_FRAME = 7, 10  # coefficients of an incidence
+zero = uint64(0)
+_1, _2, _3, _4, _5, _6 = (uint64(W * j) for j in range(1, 7))
+_7, _8, _9, _10, _11 = (uint64(W * j) for j in range(7, 12))
+_Q, _R, _S = (uint64(4 * W * j) for j in range(1, 4))  # second, third, fourth vertex in the scratch array
+
+
+@inline
+def gradients(a, b, e, share):
+    """Gradients ∂N/∂X of the shape functions of q, r, x from the rest edges, and the volume ``share * det [a b e]``."""
+    n = cross(a, b)
+    J = dot(n, e)
+    d = type(J)(1) / J
+    return scale(d, cross(b, e)), scale(d, cross(e, a)), scale(d, n), share * J
+
+
+@inline
+def node_frame(a, b, e, share):
+    """The seven coefficients (k0 .. k5, w) of an incidence from its rest edges."""
+    one = type(share)(1)
+    la = dot(a, a) ** 0.5
+    u = scale(one / la, a)
+    bu = dot(b, u)
+    t = sub(b, scale(bu, u))
+    lt = dot(t, t) ** 0.5
+    v = scale(one / lt, t)
+    h = dot(e, cross(u, v))
+    k0 = one / la
+    k2 = one / lt
+    k1 = -bu * k0 * k2
+    k5 = one / h
+    k3 = -(dot(e, u) * k0 + dot(e, v) * k1) * k5
+    k4 = -dot(e, v) * k2 * k5
+    return k0, k1, k2, k3, k4, k5, share * la * lt  # V k5, without the cancelling h
+
+
+@inline
+def deformation(a, b, e, k):
+    """F = ∂x/∂X in the node frame from the current edges."""
+    return scale(k[0], a), combine(k[1], a, k[2], b), combine3(k[3], a, k[4], b, k[5], e)
+
+
+@inline
+def outer_sum(a, ga, b, gb, e, ge):
+    """F = a ⊗ ga + b ⊗ gb + e ⊗ ge, the deformation gradient in the axes of the rest state."""
+    return (
+        combine3(ga[0], a, gb[0], b, ge[0], e),
+        combine3(ga[1], a, gb[1], b, ge[1], e),
+        combine3(ga[2], a, gb[2], b, ge[2], e),
+    )
+
+
+@inline
+def corner(X, i):
+    return X[3 * i], X[3 * i + 1], X[3 * i + 2]
+
+
+class Simplex(ElementKind):
+    """What tetrahedra and plane-strain triangles share; ``plane`` says which."""
+
+    plane = False
+
+    def width(self, model: Model) -> int:
+        return NODE_FRAME if model.isotropic else REST_FRAME
+
+    def fingerprint(self, model: Model) -> str:
+        return fingerprint(*(getattr(self, f)(model) for f in ("pack", "sweep", "energy", "forces")))
+
+    @property
+    def share(self) -> float:
+        """Volume over det [a b e]."""
+        return 1 / 2 if self.plane else 1 / 6
+
+    def _edges(self) -> Any:
+        """``(g, j, x) -> a, b, e`` from the scratch array at lane position j and the last corner x."""
+        if self.plane:
+
+            @inline
+            def edges(g, j, x):
+                p, one = vec(g, j), type(x[0])(1)
+                return sub(vec(g, _Q + j), p), (one - one, one - one, one), sub(x, p)
+        else:
+
+            @inline
+            def edges(g, j, x):
+                p = vec(g, j)
+                return sub(vec(g, _Q + j), p), sub(vec(g, _R + j), p), sub(x, p)
+
+        return edges
+
+    def pack(self, model: Model) -> Any:
+        plane, isotropic, share = self.plane, model.isotropic, self.share
+
+        @inline
+        def pack(X, cells, e, a, opposite, coef, at, block, nodal, to):
+            p = corner(X, cells[e, opposite[a, 0]])
+            ea = sub(corner(X, cells[e, opposite[a, 1]]), p)
+            eb = (0.0, 0.0, 1.0) if plane else sub(corner(X, cells[e, opposite[a, -1]]), p)
+            ee = sub(corner(X, cells[e, a]), p)
+            ga, gb, ge, V = gradients(ea, eb, ee, share)
+            k = node_frame(ea, eb, ee, share) if isotropic else (*ga, *gb, *ge, V)
+            for j in range(len(k)):
+                coef[at + W * j] = k[j]
+            s = V * block[0] * dot(ge, ge)
+            t = V * block[2]  # the second term too is constant if the block is taken at rest
+            nodal[to] += s + t * ge[0] * ge[0]
+            nodal[to + W] += t * ge[0] * ge[1]
+            nodal[to + 2 * W] += t * ge[0] * ge[2]
+            nodal[to + 3 * W] += s + t * ge[1] * ge[1]
+            nodal[to + 4 * W] += t * ge[1] * ge[2]
+            nodal[to + 5 * W] += s + t * ge[2] * ge[2]
+
+        return pack
+
+    def sweep(self, model: Model) -> Any:
+        others = self.others
+        incidence = self._incidence(model)
+        numbers = parameters(model.n_parameters)
+        idx_row, coef_row = uint64(W * others), uint64(W * self.width(model))
+
+        @inline
+        def sweep(n, i, c, x, idx, coef, par, p, g, acc):
+            b = par[p]
+            m = numbers(par, p + uint64(1))
+            for _ in range(n):
+                gather(others, i, x, idx, g, zero)
+                for l_ in range(W):
+                    l = uint64(l_)
+                    f, h, v = incidence(g, l * uint64(4), (acc[_9 + l], acc[_10 + l], acc[_11 + l]), coef, c + l, b, m)
+                    acc[l] -= f[0]
+                    acc[_1 + l] -= f[1]
+                    acc[_2 + l] -= f[2]
+                    u = scale(h, v)
+                    acc[_3 + l] += u[0] * v[0]
+                    acc[_4 + l] += u[0] * v[1]
+                    acc[_5 + l] += u[0] * v[2]
+                    acc[_6 + l] += u[1] * v[1]
+                    acc[_7 + l] += u[1] * v[2]
+                    acc[_8 + l] += u[2] * v[2]
+                i += idx_row
+                c += coef_row
+
+        return sweep
+
+    def _incidence(self, model: Model) -> Any:
+        """``(g, j, x, coef, c, b, m) -> V P g, h, v``: a node's negative force and the term h v vᵀ of its Hessian."""
+        edges, stress = self._edges(), model.stress
+        if model.isotropic:
+
+            @inline
+            def incidence(g, j, x, coef, c, b, m):
+                a, d, e = edges(g, j, x)
+                k = (coef[c], coef[c + _1], coef[c + _2], coef[c + _3], coef[c + _4], coef[c + _5])
+                w = coef[c + _6]
+                F = deformation(a, d, e, k)
+                return scale(w, stress(F, *m)[2]), b * w * k[5], cofactor(F)[2]
+        else:
+
+            @inline
+            def incidence(g, j, x, coef, c, b, m):
+                a, d, e = edges(g, j, x)
+                ga = coef[c], coef[c + _1], coef[c + _2]
+                gd = coef[c + _3], coef[c + _4], coef[c + _5]
+                ge = coef[c + _6], coef[c + _7], coef[c + _8]
+                V = coef[c + _9]
+                F = outer_sum(a, ga, d, gd, e, ge)
+                return scale(V, mat_vec(stress(F, *m), ge)), b * V, mat_vec(cofactor(F), ge)
+
+        return incidence
+
+    def _element(self) -> Any:
+        """``(g, j) -> F, ga, gb, ge, V`` from the scratch array: current positions, then rest positions."""
+        edges, share, last = self._edges(), self.share, _R if self.plane else _S
+        rest = uint64(4 * W * self.corners)
+
+        @inline
+        def element(g, j):
+            A, B, E = edges(g, rest + j, vec(g, rest + last + j))
+            ga, gb, ge, V = gradients(A, B, E, share)
+            a, b, e = edges(g, j, vec(g, last + j))
+            return outer_sum(a, ga, b, gb, e, ge), ga, gb, ge, V
+
+        return element
+
+    def energy(self, model: Model) -> Any:
+        corners, element, psi = self.corners, self._element(), model.energy
+        numbers = parameters(model.n_parameters)
+        rest, out = uint64(4 * W * corners), uint64(8 * W * corners)
+
+        @inline
+        def energy(m, i, x, X, idx, par, p, g):
+            number = numbers(par, p + uint64(1))
+            gather(corners, i, x, idx, g, zero)
+            gather(corners, i, X, idx, g, rest)
+            for l_ in range(W):
+                l = uint64(l_)
+                F, ga, gb, ge, V = element(g, l * uint64(4))
+                g[out + l] = V * psi(F, *number)
+            total = 0.0
+            for l_ in range(m):
+                total += g[out + uint64(l_)]
+            return total
+
+        return energy
+
+    def forces(self, model: Model) -> Any:
+        corners, element, psi, stress, plane = self.corners, self._element(), model.energy, model.stress, self.plane
+        numbers = parameters(model.n_parameters)
+        rest, out = uint64(4 * W * corners), uint64(8 * W * corners)
+        last = _6 if plane else _9
+
+        @inline
+        def forces(m, i, x, X, idx, par, p, g, f, o):
+            number = numbers(par, p + uint64(1))
+            gather(corners, i, x, idx, g, zero)
+            gather(corners, i, X, idx, g, rest)
+            for l_ in range(W):
+                l = uint64(l_)
+                F, ga, gb, ge, V = element(g, l * uint64(4))
+                P = stress(F, *number)
+                fa = scale(-V, mat_vec(P, ga))
+                fb = scale(-V, mat_vec(P, gb))
+                fe = scale(-V, mat_vec(P, ge))
+                fp = scale(-1.0, add(fa, fe)) if plane else scale(-1.0, add(add(fa, fb), fe))
+                t = o + l
+                f[t], f[t + _1], f[t + _2] = fp
+                f[t + _3], f[t + _4], f[t + _5] = fa
+                if not plane:
+                    f[t + _6], f[t + _7], f[t + _8] = fb
+                f[t + last], f[t + last + _1], f[t + last + _2] = fe
+                norm2 = dot(fp, fp) + dot(fa, fa) + dot(fe, fe)
+                if not plane:
+                    norm2 += dot(fb, fb)
+                g[out + l] = V * psi(F, *number)
+                g[out + _1 + l] = norm2**0.5
+                g[out + _2 + l] = det(F)
+            total, size, inverted = 0.0, 0.0, 0
+            for l_ in range(m):
+                l = uint64(l_)
+                total += g[out + l]
+                size += g[out + _1 + l]
+                inverted += g[out + _2 + l] < 0.0
+            return total, size, inverted
+
+        return forces
+
+
+class Tet(Simplex):
+    """Linear tetrahedra."""
+
+    name = "tet"
+    corners = 4
+    others = 3
+    opposite = np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]])
+
+
+class PlaneTriangle(Simplex):
+    """Linear triangles in plane strain: F₃₃ = 1, and z never moves."""
+
+    name = "triangle"
+    corners = 3
+    others = 2
+    opposite = np.array([[2, 1], [0, 2], [1, 0]])
+    plane = True
+
+
+TET, PLANE_TRIANGLE = Tet(), PlaneTriangle()

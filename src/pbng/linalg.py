@@ -1,0 +1,201 @@
+"""Vectors and 3x3 matrices as tuples of scalars: what the kernels are written in.
+
+A vector is a tuple of three scalars, a matrix a tuple of its three columns. Everything is inlined and keeps the type of
+its arguments (float32 stays float32), so a formula written with these is as fast as one written out by hand; what a
+caller does not use of a result costs nothing.
+"""
+
+import math
+
+from numba import types
+from numba.extending import overload
+
+from pbng.jit import FLAGS, inline
+
+
+@inline
+def add(a, b):
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@inline
+def sub(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@inline
+def scale(s, a):
+    return s * a[0], s * a[1], s * a[2]
+
+
+@inline
+def combine(s, a, t, b):
+    """s a + t b."""
+    return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
+
+
+@inline
+def combine3(s, a, t, b, u, c):
+    """s a + t b + u c."""
+    return (
+        s * a[0] + t * b[0] + u * c[0],
+        s * a[1] + t * b[1] + u * c[1],
+        s * a[2] + t * b[2] + u * c[2],
+    )
+
+
+@inline
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inline
+def cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inline
+def identity(like):
+    """The unit matrix in the type of the scalar ``like``."""
+    one = type(like)(1)
+    zero = type(like)(0)
+    return (one, zero, zero), (zero, one, zero), (zero, zero, one)
+
+
+@inline
+def mat_add(A, B):
+    return add(A[0], B[0]), add(A[1], B[1]), add(A[2], B[2])
+
+
+@inline
+def mat_sub(A, B):
+    return sub(A[0], B[0]), sub(A[1], B[1]), sub(A[2], B[2])
+
+
+@inline
+def mat_scale(s, A):
+    return scale(s, A[0]), scale(s, A[1]), scale(s, A[2])
+
+
+@inline
+def mat_combine(s, A, t, B):
+    """s A + t B."""
+    return combine(s, A[0], t, B[0]), combine(s, A[1], t, B[1]), combine(s, A[2], t, B[2])
+
+
+@inline
+def mat_vec(A, v):
+    return combine3(v[0], A[0], v[1], A[1], v[2], A[2])
+
+
+@inline
+def mat_mul(A, B):
+    return mat_vec(A, B[0]), mat_vec(A, B[1]), mat_vec(A, B[2])
+
+
+@inline
+def transpose(A):
+    return (A[0][0], A[1][0], A[2][0]), (A[0][1], A[1][1], A[2][1]), (A[0][2], A[1][2], A[2][2])
+
+
+@inline
+def trace(A):
+    return A[0][0] + A[1][1] + A[2][2]
+
+
+@inline
+def norm2(A):
+    """Squared Frobenius norm |A|²."""
+    return dot(A[0], A[0]) + dot(A[1], A[1]) + dot(A[2], A[2])
+
+
+@inline
+def cofactor(F):
+    """H = cof F = ∂J/∂F, from products of entries: defined for singular and inverted F."""
+    return cross(F[1], F[2]), cross(F[2], F[0]), cross(F[0], F[1])
+
+
+@inline
+def det(F):
+    """J = det F."""
+    return dot(F[2], cross(F[0], F[1]))
+
+
+@inline
+def _halley(s, I1, I2, J):
+    """One Halley step for the largest root of s⁴ - 2 I1 s² - 8 J s + I1² - 4 I2; from above it stays above."""
+    real = type(s)
+    q = s * s
+    t = q - I1
+    value = t * t - real(8) * J * s - real(4) * I2
+    slope = s * t - real(2) * J  # a quarter of the derivative
+    curve = real(3) * q - I1  # a quarter of the second derivative
+    return s - value * slope / max(real(4) * slope * slope - real(0.5) * value * curve, real(1e-24))
+
+
+def _refine(s, I1, I2, J):
+    raise TypeError("called from compiled code only")
+
+
+@overload(_refine, jit_options={"forceinline": True, **FLAGS})
+def _(s, I1, I2, J):
+    """Three steps reach rounding in float32, six in float64 (unrolled: a loop would keep LLVM from vectorising)."""
+
+    @inline
+    def thrice(s, I1, I2, J):
+        return _halley(_halley(_halley(s, I1, I2, J), I1, I2, J), I1, I2, J)
+
+    if s == types.float32:
+        return lambda s, I1, I2, J: thrice(s, I1, I2, J)
+    return lambda s, I1, I2, J: thrice(thrice(s, I1, I2, J), I1, I2, J)
+
+
+@inline
+def rotation(F):
+    """Rotation R of the polar decomposition F = R S with det R = +1 always, also for det F <= 0; no SVD.
+
+    The trace s of S is the largest root of a quartic in the invariants; R then follows in closed form (docs/method.md,
+    "Polar decomposition without an SVD"). Where R is not unique the denominator is clamped: R is finite, its columns
+    at most of unit length. The root is approached from above: (s² - I1)² = 4 (I2 + 2 J s), and the right-hand side
+    is at most 12 I2, or 4 I2 if J <= 0.
+    """
+    real = type(F[0][0])
+    H = cofactor(F)
+    J = dot(F[2], H[2])
+    C00 = dot(F[0], F[0])
+    C11 = dot(F[1], F[1])
+    C22 = dot(F[2], F[2])
+    C01 = dot(F[0], F[1])
+    C02 = dot(F[0], F[2])
+    C12 = dot(F[1], F[2])
+    I1 = C00 + C11 + C22
+    I2 = dot(H[2], H[2]) + (C00 * C22 - C02 * C02) + (C11 * C22 - C12 * C12)  # |H|², with one column of H
+    bound = (real(12) if J > real(0) else real(4)) * max(I2, real(0))
+    s = _refine(math.sqrt(I1 + math.sqrt(bound) + real(1e-12)), I1, I2, J)
+    q = s * s
+    d = real(1) / max(s * (q - I1) - real(2) * J, real(1e-6) * q * s)
+    m = (q + I1) * d
+    e = real(2) * s * d
+    k = real(2) * d
+    return (
+        sub(combine(m - k * C00, F[0], e, H[0]), combine(k * C01, F[1], k * C02, F[2])),
+        sub(combine(m - k * C11, F[1], e, H[1]), combine(k * C01, F[0], k * C12, F[2])),
+        sub(combine(m - k * C22, F[2], e, H[2]), combine(k * C02, F[0], k * C12, F[1])),
+    )
+
+
+@inline
+def solve_spd(a00, a01, a02, a11, a12, a22, b0, b1, b2):
+    """Solution of the symmetric positive definite 3x3 system with the given upper triangle, by cofactors."""
+    c00 = a11 * a22 - a12 * a12
+    c01 = a02 * a12 - a01 * a22
+    c02 = a01 * a12 - a02 * a11
+    c11 = a00 * a22 - a02 * a02
+    c12 = a01 * a02 - a00 * a12
+    c22 = a00 * a11 - a01 * a01
+    d = type(a00)(1) / (a00 * c00 + a01 * c01 + a02 * c02)
+    return (
+        (c00 * b0 + c01 * b1 + c02 * b2) * d,
+        (c01 * b0 + c11 * b1 + c12 * b2) * d,
+        (c02 * b0 + c12 * b1 + c22 * b2) * d,
+    )

@@ -1,0 +1,1 @@
+"""Hyperelastic materials: one file a model."""

@@ -1,0 +1,88 @@
+"""The sweep: every free node moves to the minimum of the energy that it sees, colour by colour (section 7).
+
+One sub-iterate, Eqs. (28)-(34), for the 16 nodes of a block at once::
+
+    f   = f_ext - Σ_e V_e P g_i          forces on the nodes, element group by element group
+    A   = A_0 + Σ_e V_e b c cᵀ           their majorising Hessians; A_0 holds all that is constant
+    x_i = x_i + ω A⁻¹ f                  one step, no line search
+"""
+
+import numpy as np
+from numba import njit, prange, uint64
+
+from pbng.dispatch import specialised, term_sweep
+from pbng.elements.base import W
+from pbng.jit import FLAGS, inline
+from pbng.linalg import solve_spd
+from pbng.packing import NODAL, Packed
+
+GRAIN = 16  # blocks a thread takes at a time
+_1, _2, _3, _4, _5, _6 = (uint64(W * j) for j in range(1, 7))
+_7, _8, _9, _10, _11 = (uint64(W * j) for j in range(7, 12))
+
+
+def sweep(packed: Packed, x: np.ndarray, colors: np.ndarray, omega: float = 1.0) -> None:
+    """Update every free node once, in place.
+
+    Args:
+        packed: The problem's layout.
+        x: Positions as ``packed.pack`` makes them.
+        colors: Colours in the order to be taken; several sweeps at once by repeating them.
+        omega: Relaxation of each node's step; 0 < omega < 2 never raises the energy.
+    """
+    p = packed
+    specialised(make_sweep, p.terms)(
+        x, colors, p.color_start, p.seg_start, p.seg, p.idx, p.coef, p.nodal, p.parameters, p.dtype.type(omega)
+    )
+
+
+def make_sweep(key: str):
+    """Kernel of :func:`sweep`."""
+
+    @njit(parallel=True, cache=True, **FLAGS)
+    def run(x, colors, color_start, seg_start, seg, idx, coef, nodal, par, omega):
+        for n in range(colors.size):
+            low = color_start[colors[n]]
+            high = color_start[colors[n] + 1]
+            for chunk in prange((high - low + GRAIN - 1) // GRAIN):
+                g = np.empty(12 * W, x.dtype)
+                acc = np.empty(12 * W, x.dtype)
+                for b in range(low + chunk * GRAIN, min(high, low + (chunk + 1) * GRAIN)):
+                    _load(uint64(b), x, nodal, acc)
+                    for s in range(seg_start[b], seg_start[b + 1]):
+                        k, p, rows, i, c = seg[s]
+                        term_sweep(key, k, (rows, uint64(i), uint64(c), x, idx, coef, par, uint64(p), g, acc))
+                    _step(uint64(b), x, acc, omega)
+
+    return run
+
+
+@inline
+def _load(b, x, nodal, acc):
+    """Start a block: external forces and constant Hessians (rows 0-8 of acc), positions (rows 9-11)."""
+    n = b * uint64(NODAL * W)
+    for l_ in range(NODAL * W):
+        l = uint64(l_)
+        acc[l] = nodal[n + l]
+    at = b * uint64(4 * W)
+    for l_ in range(W):
+        l = uint64(l_)
+        i = at + uint64(4) * l
+        acc[_9 + l] = x[i]
+        acc[_10 + l] = x[i + uint64(1)]
+        acc[_11 + l] = x[i + uint64(2)]
+
+
+@inline
+def _step(b, x, acc, omega):
+    """Finish a block: solve the 3x3 systems and move the nodes, Eq. (30)."""
+    at = b * uint64(4 * W)
+    for l_ in range(W):
+        l = uint64(l_)
+        i = at + uint64(4) * l
+        dx, dy, dz = solve_spd(
+            acc[_3 + l], acc[_4 + l], acc[_5 + l], acc[_6 + l], acc[_7 + l], acc[_8 + l], acc[l], acc[_1 + l], acc[_2 + l]
+        )
+        x[i] = acc[_9 + l] + omega * dx
+        x[i + uint64(1)] = acc[_10 + l] + omega * dy
+        x[i + uint64(2)] = acc[_11 + l] + omega * dz
