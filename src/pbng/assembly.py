@@ -14,7 +14,6 @@ from pbng.elements.base import W
 from pbng.jit import FLAGS, kernel, serial
 
 CHUNK = 64  # blocks a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
-SCRATCH = 9 * 4 * W
 
 
 class Evaluation:
@@ -95,11 +94,12 @@ def make_energy(key: str):
         n = blocks.shape[0]
         part = np.zeros((n + CHUNK - 1) // CHUNK)
         for chunk in prange(part.size):
-            g = np.empty(SCRATCH)
+            g = np.empty(32 * W)
+            out = np.empty(W)
             total = 0.0
             for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
                 k, p, i, m = blocks[b]
-                total += term_energy(key, k, (m, uint64(i), x, X, idx, par, uint64(p), g))
+                total += term_energy(key, k, (m, uint64(i), x, X, idx, par, uint64(p), g, out))
             part[chunk] = total
         return part.sum()
 
@@ -114,11 +114,12 @@ def make_forces(key: str):
         n = blocks.shape[0]
         part = np.zeros(((n + CHUNK - 1) // CHUNK, 3))
         for chunk in prange(part.shape[0]):
-            g = np.empty(SCRATCH)
+            g = np.empty(32 * W)
+            out = np.empty(15 * W)
             for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
                 k, p, i, m = blocks[b]
                 e, s, inverted = term_forces(
-                    key, k, (m, uint64(i), x, X, idx, par, uint64(p), g, f, uint64(3) * uint64(i))
+                    key, k, (m, uint64(i), x, X, idx, par, uint64(p), g, out, f, uint64(3) * uint64(i))
                 )
                 part[chunk, 0] += e
                 part[chunk, 1] += s

@@ -7,6 +7,7 @@ caller does not use of a result costs nothing.
 
 import math
 
+import numpy as np
 from numba import types
 from numba.extending import overload
 
@@ -133,21 +134,35 @@ def _halley(s, I1, I2, J):
     return s - value * slope / max(real(4) * slope * slope - real(0.5) * value * curve, real(1e-24))
 
 
-def _refine(s, I1, I2, J):
+@inline
+def _halley_thrice(s, I1, I2, J):
+    """Unrolled: a loop would keep LLVM from vectorising the kernel around it."""
+    return _halley(_halley(_halley(s, I1, I2, J), I1, I2, J), I1, I2, J)
+
+
+@inline
+def _trace_bound(I1, I2, J):
+    """An upper bound on tr S, exact at rest: (s² - I1)² = 4 (I2 + 2 J s) is at most 12 I2, or 4 I2 if J <= 0."""
+    real = type(I1)
+    bound = (real(12) if J > real(0) else real(4)) * max(I2, real(0))
+    return math.sqrt(I1 + math.sqrt(bound) + real(1e-12))
+
+
+def _stretch_trace(I1, I2, J):
     raise TypeError("called from compiled code only")
 
 
-@overload(_refine, jit_options={"forceinline": True, **FLAGS})
-def _(s, I1, I2, J):
-    """Three steps reach rounding in float32, six in float64 (unrolled: a loop would keep LLVM from vectorising)."""
+@overload(_stretch_trace, jit_options={"forceinline": True, **FLAGS})
+def _(I1, I2, J):
+    """tr S to rounding: three steps in float32; in float64 as many with float32's cheap divisions, then three more."""
+    if I1 == types.float32:
+        return lambda I1, I2, J: _halley_thrice(_trace_bound(I1, I2, J), I1, I2, J)
 
-    @inline
-    def thrice(s, I1, I2, J):
-        return _halley(_halley(_halley(s, I1, I2, J), I1, I2, J), I1, I2, J)
+    def double(I1, I2, J):
+        i1, i2, j = np.float32(I1), np.float32(I2), np.float32(J)
+        return _halley_thrice(np.float64(_halley_thrice(_trace_bound(i1, i2, j), i1, i2, j)), I1, I2, J)
 
-    if s == types.float32:
-        return lambda s, I1, I2, J: thrice(s, I1, I2, J)
-    return lambda s, I1, I2, J: thrice(thrice(s, I1, I2, J), I1, I2, J)
+    return double
 
 
 @inline
@@ -156,8 +171,7 @@ def rotation(F):
 
     The trace s of S is the largest root of a quartic in the invariants; R then follows in closed form (docs/method.md,
     "Polar decomposition without an SVD"). Where R is not unique the denominator is clamped: R is finite, its columns
-    at most of unit length. The root is approached from above: (s² - I1)² = 4 (I2 + 2 J s), and the right-hand side
-    is at most 12 I2, or 4 I2 if J <= 0.
+    at most of unit length.
     """
     real = type(F[0][0])
     H = cofactor(F)
@@ -170,8 +184,7 @@ def rotation(F):
     C12 = dot(F[1], F[2])
     I1 = C00 + C11 + C22
     I2 = dot(H[2], H[2]) + (C00 * C22 - C02 * C02) + (C11 * C22 - C12 * C12)  # |H|², with one column of H
-    bound = (real(12) if J > real(0) else real(4)) * max(I2, real(0))
-    s = _refine(math.sqrt(I1 + math.sqrt(bound) + real(1e-12)), I1, I2, J)
+    s = _stretch_trace(I1, I2, J)
     q = s * s
     d = real(1) / max(s * (q - I1) - real(2) * J, real(1e-6) * q * s)
     m = (q + I1) * d

@@ -266,6 +266,13 @@ class TriMesh(Mesh):
         cells[flipped] = cells[flipped][:, [0, 2, 1]]
         return cells, flipped
 
+    @cached_property
+    def boundary_edges(self) -> np.ndarray:
+        """Edges (m, 2) int32 that belong to one triangle only."""
+        pairs = np.sort(self.cells[:, TRIANGLE_EDGES].reshape(-1, 2), axis=1)
+        edges, count = np.unique(pairs, axis=0, return_counts=True)
+        return edges[count == 1]
+
     @property
     def is_plane(self) -> bool:
         """Whether the mesh lies in a plane of constant z."""

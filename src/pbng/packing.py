@@ -62,6 +62,13 @@ class Packed:
         """Memory [bytes] of the layout."""
         return sum(a.nbytes for a in (self.seg, self.idx, self.coef, self.nodal, self.slot))
 
+    def stiffness(self) -> np.ndarray:
+        """Constant part of each node's stiffness [N/m], a third of its Hessian's trace, (n_block * W,)."""
+        nodal = self.nodal.reshape(-1, NODAL, W)
+        real = np.zeros((self.n_block, W), bool)
+        real.ravel()[self.slot[self.slot < self.n_block * W]] = True
+        return np.where(real, nodal[:, 3] + nodal[:, 6] + nodal[:, 8], 0.0).ravel() / 3
+
     def pack(self, x: np.ndarray) -> np.ndarray:
         """Positions (n_vert, 3) as the flat array (4 n_slot,) that kernels read."""
         out = aligned(4 * self.n_slot, self.dtype)

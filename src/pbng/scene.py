@@ -1,0 +1,287 @@
+"""Scenes: bodies, what holds and moves them, what loads them; ``compile`` makes the frozen problem."""
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pbng.elements.base import ElementKind
+from pbng.elements.simplex import PLANE_TRIANGLE, TET
+from pbng.errors import InputError
+from pbng.materials.base import Material
+from pbng.mesh import Mesh, TetMesh, TriMesh, triangle_areas
+from pbng.motions import Motion, as_motion
+from pbng.problem import BodyRange, ElementGroup, Problem
+
+log = logging.getLogger("pbng")
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A mesh with its material or materials, as part of a scene."""
+
+    name: str
+    mesh: Mesh
+    materials: tuple[tuple[Material, np.ndarray], ...]  # with the cells each holds for
+    start: int  # number of its first vertex in the scene
+
+    def where(self, *which: Any, **conditions: Any) -> "Selection":
+        """Vertices of this body, chosen as by :meth:`pbng.mesh.Mesh.where`."""
+        words = [repr(w) if isinstance(w, str) else type(w).__name__ for w in which]
+        words += [f"{k}={v}" for k, v in conditions.items()]
+        return Selection(self, self.mesh.where(*which, **conditions), ", ".join(words))
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Vertices (k,) of a body, and the words that chose them."""
+
+    body: Body
+    vertices: np.ndarray
+    words: str
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    @property
+    def index(self) -> np.ndarray:
+        """Their numbers in the scene, (k,)."""
+        return self.body.start + self.vertices
+
+
+@dataclass(frozen=True, eq=False)
+class _Move:
+    """Prescribed vertices, by index in the scene; a pin has no motion."""
+
+    index: np.ndarray
+    motion: Motion | None
+    start: float
+    over: float
+
+
+class Scene:
+    """What is simulated. Scenes never see solvers.
+
+    Args:
+        gravity: Acceleration [m/s²]; default none.
+        name: Shown in reports.
+    """
+
+    def __init__(self, gravity: Sequence[float] = (0.0, 0.0, 0.0), name: str = "scene") -> None:
+        self.name = name
+        self.gravity = _vector("gravity", gravity)
+        self.bodies: list[Body] = []
+        self._moves: list[_Move] = []
+        self._forces: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def add(
+        self, mesh: Mesh, material: Material | Mapping[str, Material], name: str | None = None, at: Any = None
+    ) -> Body:
+        """Add a body.
+
+        Args:
+            mesh: Its rest state.
+            material: One material, or one for each of the mesh's cell groups, which must cover every cell once.
+            name: Unique; by default numbered.
+            at: Translation [m] of the mesh, (3,).
+
+        Raises:
+            InputError: The name is taken, groups are unknown, overlap or leave cells out, or a triangle mesh is not plane.
+        """
+        name = f"body{len(self.bodies)}" if name is None else name
+        if name in (b.name for b in self.bodies):
+            raise InputError(f"the scene already has a body named {name!r}")
+        if not isinstance(mesh, Mesh):
+            raise InputError(f"body {name!r}: expected a TetMesh or TriMesh, not {type(mesh).__name__}")
+        if isinstance(mesh, TriMesh) and not mesh.is_plane:
+            raise InputError(f"body {name!r}: a solid in two dimensions must lie in a plane of constant z")
+        if at is not None:
+            mesh = _translated(mesh, np.array(_vector(f"body {name!r}: at", at)))
+        start = sum(b.mesh.n_vert for b in self.bodies)
+        body = Body(name, mesh, _materials(name, mesh, material), start)
+        self.bodies.append(body)
+        return body
+
+    def pin(self, selection: Selection) -> None:
+        """Hold vertices where they are at rest."""
+        self._moves.append(_Move(self._checked("pin", selection), None, 0.0, 0.0))
+
+    def move(self, selection: Selection, motion: Any, over: float = 0.0, start: float = 0.0) -> None:
+        """Prescribe the motion of vertices.
+
+        Moves of the same vertices follow upon each other: each starts from where the one before has left them.
+
+        Args:
+            selection: The vertices.
+            motion: A :class:`pbng.Motion`, or a function ``(t, X) -> x``. Rotations and scalings act about the
+                selection's centroid unless they name a center.
+            over: Seconds [s] in which it is carried out at a steady rate; 0 at once.
+            start: Time [s] at which it begins.
+
+        Raises:
+            InputError: The selection is empty, or shares only some vertices with that of an earlier pin or move.
+        """
+        if not (math.isfinite(over) and over >= 0 and math.isfinite(start) and start >= 0):
+            raise InputError(f"move: over and start must be finite and not negative, not {over} and {start}")
+        self._moves.append(_Move(self._checked("move", selection), as_motion(motion), start, over))
+
+    def force(self, selection: Selection, force: Sequence[float]) -> None:
+        """Spread a total force [N] evenly over vertices."""
+        index = self._checked("force", selection)
+        self._forces.append((index, np.tile(np.array(_vector("force", force)) / len(index), (len(index), 1))))
+
+    def traction(self, selection: Selection, traction: Sequence[float]) -> None:
+        """Apply a traction [N/m²] to the part of the surface whose triangles' vertices are all selected, Eq. (16).
+
+        Per rest area and of fixed direction. In the plane the boundary's edges take the place of triangles [N/m].
+        """
+        index = self._checked("traction", selection)
+        mesh, start = selection.body.mesh, selection.body.start
+        chosen = np.zeros(mesh.n_vert, bool)
+        chosen[selection.vertices] = True
+        faces = mesh.surface if isinstance(mesh, TetMesh) else mesh.boundary_edges
+        faces = faces[chosen[faces].all(1)]
+        if len(faces) == 0:
+            raise InputError(f"traction on {selection.words}: no whole face of the surface is selected")
+        if isinstance(mesh, TetMesh):
+            measure = np.linalg.norm(triangle_areas(mesh.X, faces), axis=1)
+        else:
+            measure = np.linalg.norm(mesh.X[faces[:, 1]] - mesh.X[faces[:, 0]], axis=1)
+        share = np.zeros(mesh.n_vert)
+        np.add.at(share, faces, (measure / faces.shape[1])[:, None])
+        self._forces.append((index, np.outer(share[index - start], np.array(_vector("traction", traction)))))
+
+    def _checked(self, what: str, selection: Selection) -> np.ndarray:
+        if not isinstance(selection, Selection):
+            raise InputError(f"{what}: expected a selection such as body.where(x=0), not {type(selection).__name__}")
+        if not any(b is selection.body for b in self.bodies):
+            raise InputError(f"{what}: body {selection.body.name!r} belongs to another scene")
+        if len(selection) == 0:
+            low, high = selection.body.mesh.X.min(0), selection.body.mesh.X.max(0)
+            spans = ", ".join(f"{a} in [{l:g}, {h:g}]" for a, l, h in zip("xyz", low, high))
+            raise InputError(f"{what}: {selection.body.name}.where({selection.words}) selects no vertex; it has {spans}")
+        return selection.index
+
+    def compile(self) -> Problem:
+        """The discrete problem of this scene as it now stands.
+
+        Raises:
+            InputError: There is no body, no vertex is prescribed, or selections of moves overlap in part.
+        """
+        if not self.bodies:
+            raise InputError("the scene has no body")
+        X = np.concatenate([b.mesh.X for b in self.bodies])
+        groups: dict[tuple[ElementKind, Material], list[np.ndarray]] = {}
+        mass = np.zeros(len(X))
+        for b in self.bodies:
+            kind = TET if isinstance(b.mesh, TetMesh) else PLANE_TRIANGLE
+            for material, cells in b.materials:
+                global_cells = (b.mesh.cells[cells] + b.start).astype(np.int32)
+                groups.setdefault((kind, material), []).append(global_cells)
+                weight = material.density * b.mesh.volume[cells] / kind.corners
+                mass += np.bincount(global_cells.ravel(), np.repeat(weight, kind.corners), len(X))
+        f_ext = np.outer(mass, self.gravity)
+        for index, force in self._forces:
+            np.add.at(f_ext, index, force)
+        prescribed = _Prescribed(X, self._moves)
+        fixed = np.zeros(len(X), bool)
+        fixed[prescribed.index] = True
+        if not fixed.any():
+            raise InputError("no vertex is pinned or moved: the equilibrium is not unique; pin a part of each body")
+        problem = Problem(
+            name=self.name,
+            X=X,
+            groups=tuple(ElementGroup(kind, m, np.concatenate(cells)) for (kind, m), cells in groups.items()),
+            bodies=tuple(BodyRange(b.name, b.start, b.start + b.mesh.n_vert, b.mesh) for b in self.bodies),
+            fixed=fixed,
+            prescribed=prescribed,
+            f_ext=f_ext,
+            mass=mass,
+            end=prescribed.end,
+        )
+        self._warn_of_loose_parts(problem)
+        return problem
+
+    def _warn_of_loose_parts(self, problem: Problem) -> None:
+        held = np.zeros(problem.component.max() + 1, int)
+        np.add.at(held, problem.component[problem.fixed], 1)
+        for label in np.flatnonzero(held == 0):
+            v = int(np.flatnonzero(problem.component == label)[0])
+            body = next(b for b in problem.bodies if b.start <= v < b.stop)
+            size = int((problem.component == label).sum())
+            log.warning(
+                "a part of body %r (%d vertices, among them %d) has no prescribed vertex: it can move as a rigid body,"
+                " and under load it has no equilibrium",
+                body.name, size, v - body.start,
+            )  # fmt: skip
+
+
+class _Prescribed:
+    """Positions of the prescribed vertices as a function of time."""
+
+    def __init__(self, X: np.ndarray, moves: list[_Move]) -> None:
+        self.sequences: list[tuple[np.ndarray, list[_Move]]] = []
+        owner = np.full(len(X), -1)
+        for move in moves:
+            owners = np.unique(owner[move.index])
+            if len(owners) == 1 and owners[0] >= 0 and len(self.sequences[owners[0]][0]) == len(move.index):
+                self.sequences[owners[0]][1].append(move)
+            elif len(owners) == 1 and owners[0] < 0:
+                owner[move.index] = len(self.sequences)
+                self.sequences.append((move.index, [move]))
+            else:
+                shared = int((owner[move.index] >= 0).sum())
+                raise InputError(
+                    f"a selection of {len(move.index)} vertices to move shares {shared} with earlier pins or moves;"
+                    " selections must be the same or have no vertex in common"
+                )
+        self.X = X
+        self.index = np.flatnonzero(owner >= 0)
+        self.end = max((m.start + m.over for m in moves), default=0.0)
+
+    def __call__(self, t: float) -> np.ndarray:
+        x = self.X.copy()
+        for index, moves in self.sequences:
+            for move in moves:
+                if move.motion is not None and t >= move.start:
+                    s = 1.0 if move.over == 0 else min((t - move.start) / move.over, 1.0)
+                    x[index] = move.motion.at(x[index], x[index].mean(0), s, t)
+        return x[self.index]
+
+
+def _materials(name: str, mesh: Mesh, material: Any) -> tuple[tuple[Material, np.ndarray], ...]:
+    if isinstance(material, Material):
+        return ((material, np.arange(mesh.n_elem)),)
+    if not isinstance(material, Mapping) or not material:
+        raise InputError(f"body {name!r}: expected a material or a mapping of cell groups to materials, not {material!r}")
+    times = np.zeros(mesh.n_elem, int)
+    parts = []
+    for group, m in material.items():
+        if group not in mesh.cell_groups:
+            raise InputError(f"body {name!r}: no cell group {group!r}; the mesh has {sorted(mesh.cell_groups) or 'none'}")
+        if not isinstance(m, Material):
+            raise InputError(f"body {name!r}: cell group {group!r} needs a material, not {m!r}")
+        times[mesh.cell_groups[group]] += 1
+        parts.append((m, mesh.cell_groups[group]))
+    wrong = np.flatnonzero(times != 1)
+    if len(wrong):
+        raise InputError(
+            f"body {name!r}: cell {wrong[0]} belongs to {times[wrong[0]]} of the groups {sorted(material)}, not to one"
+            f" ({len(wrong)} such cells)"
+        )
+    return tuple(parts)
+
+
+def _translated(mesh: Mesh, by: np.ndarray) -> Mesh:
+    extra = {"skin": mesh.skin} if isinstance(mesh, TetMesh) else {}
+    return type(mesh)(mesh.X + by, mesh.cells, groups=mesh.groups, cell_groups=mesh.cell_groups, **extra)
+
+
+def _vector(what: str, values: Any) -> tuple[float, ...]:
+    vector = tuple(float(v) for v in values)
+    if len(vector) != 3 or not all(math.isfinite(v) for v in vector):
+        raise InputError(f"{what} must be 3 finite numbers, not {vector}")
+    return vector

@@ -1,0 +1,229 @@
+"""Accelerations of a fixed-point iteration x <- G(x), for PBNG one sweep (section 7.3 and docs/method.md).
+
+Each is a frozen description; ``start`` makes the state of one solve. Only free vertices are touched: the arrays given
+are the leading, free part of a flat position array.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numba import prange
+
+from pbng.errors import InputError
+from pbng.jit import kernel
+
+CHUNK = 8192  # entries a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
+
+
+class FixedPoint(Protocol):
+    """What is accelerated; arrays are flat positions, of which the first ``n_free`` entries are free."""
+
+    n_free: int
+
+    def apply(self, x: np.ndarray, omega: float = 1.0) -> None:
+        """x <- G(x), each node's step relaxed by omega."""
+
+    def energy(self, x: np.ndarray) -> float:
+        """Potential energy [J] in float64."""
+
+
+class Iteration(Protocol):
+    """The state of one accelerated solve."""
+
+    def step(self, x: np.ndarray) -> None:
+        """One iteration, in place."""
+
+
+class Acceleration(Protocol):
+    """Description of an acceleration."""
+
+    def start(self, map: FixedPoint) -> Iteration:
+        """Begin with an empty history."""
+
+
+@dataclass(frozen=True)
+class NodeSOR:
+    """Classical successive over-relaxation: x_i += ω A⁻¹ f for each node in turn; ω = 1 is the plain method.
+
+    Energy never rises for 0 < ω < 2.
+    """
+
+    omega: float = 1.7
+
+    def __post_init__(self) -> None:
+        if not 0 < self.omega < 2:
+            raise InputError(f"NodeSOR: omega must lie strictly between 0 and 2, not {self.omega}")
+
+    def start(self, map: FixedPoint) -> Iteration:
+        return _Sweeps(map, self.omega)
+
+
+class _Sweeps:
+    def __init__(self, map: FixedPoint, omega: float) -> None:
+        self.map, self.omega = map, omega
+
+    def step(self, x: np.ndarray) -> None:
+        self.map.apply(x, self.omega)
+
+
+@dataclass(frozen=True)
+class SOR:
+    """SOR as the paper prints it, a two-step method: x⁺ = ω (G(x) - x⁻) + x⁻. May diverge; kept for comparison."""
+
+    omega: float = 1.7
+
+    def start(self, map: FixedPoint) -> Iteration:
+        return _TwoStep(map, lambda l: self.omega, 1.0)
+
+
+@dataclass(frozen=True)
+class Chebyshev:
+    """Chebyshev semi-iteration as printed: x⁺ = ω_l (γ (G(x) - x) + x - x⁻) + x⁻. May diverge; for comparison."""
+
+    rho: float = 0.95
+    gamma: float = 1.7
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rho < 1:
+            raise InputError(f"Chebyshev: rho must lie in [0, 1), not {self.rho}")
+
+    def start(self, map: FixedPoint) -> Iteration:
+        omega = [1.0, 1.0, 2 / (2 - self.rho**2)]
+
+        def next_omega(l: int) -> float:
+            while len(omega) <= l:
+                omega.append(4 / (4 - self.rho**2 * omega[-1]))
+            return omega[l]
+
+        return _TwoStep(map, next_omega, self.gamma)
+
+
+class _TwoStep:
+    """x⁺ = ω_l (γ (G(x) - x) + x - x⁻) + x⁻ for l = 1, 2, ...; SOR is γ = 1 with a constant ω."""
+
+    def __init__(self, map: FixedPoint, omega, gamma: float) -> None:
+        self.map, self.omega, self.gamma, self.l = map, omega, gamma, 0
+        self.before: np.ndarray | None = None
+
+    def step(self, x: np.ndarray) -> None:
+        n, real = self.map.n_free, x.dtype.type
+        here = x[:n].copy()
+        before = here if self.before is None else self.before
+        self.map.apply(x)
+        self.l += 1
+        omega, gamma = real(self.omega(self.l)), real(self.gamma)
+        x[:n] = omega * (gamma * (x[:n] - here) + here - before) + before
+        self.before = here
+
+
+@dataclass(frozen=True)
+class Anderson:
+    """Anderson mixing of the last ``memory`` sweeps, taken only where it lowers the energy; never diverges.
+
+    With f_k = G(x_k) - x_k, θ minimises |f_k - ΔF θ| and x_{k+1} = G(x_k) - ΔG θ if that is no higher than x_k, else
+    G(x_k), after which the history starts afresh.
+    """
+
+    memory: int = 10
+    omega: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.memory, int) and self.memory >= 1):
+            raise InputError(f"Anderson: memory must be a whole number of at least 1, not {self.memory}")
+        if not 0 < self.omega < 2:
+            raise InputError(f"Anderson: omega must lie strictly between 0 and 2, not {self.omega}")
+
+    def start(self, map: FixedPoint) -> Iteration:
+        return _Mixing(map, self.memory, self.omega)
+
+
+class _Mixing:
+    def __init__(self, map: FixedPoint, memory: int, omega: float) -> None:
+        self.map, self.memory, self.omega = map, memory, omega
+        self.energy = math.inf
+        self.rejected = 0
+        self.buffers: tuple[np.ndarray, ...] = ()
+
+    def step(self, x: np.ndarray) -> None:
+        n = self.map.n_free
+        if not self.buffers:
+            self._allocate(x, n)
+        g, mixed = self.buffers
+        g[:] = x
+        self.map.apply(g, self.omega)
+        if self._push(x[:n], g[:n]):
+            mixed[:] = g
+            _mix(g[:n], self.dG, self._weights(), mixed[:n])
+            energy = self.map.energy(mixed)
+            if energy <= self.energy:
+                x[:], self.energy = mixed, energy
+                return
+            self.count, self.rejected = -1, self.rejected + 1
+        x[:], self.energy = g, self.map.energy(g)
+
+    def _allocate(self, x: np.ndarray, n: int) -> None:
+        self.buffers = np.empty_like(x), np.empty_like(x)
+        self.dF, self.dG = np.zeros((self.memory, n), x.dtype), np.zeros((self.memory, n), x.dtype)
+        self.f, self.g = np.zeros(n, x.dtype), np.zeros(n, x.dtype)
+        self.gram, self.rhs = np.zeros((self.memory, self.memory)), np.zeros(self.memory)
+        self.count = -1  # differences stored since the last restart; -1: not even a first f
+
+    def _push(self, x: np.ndarray, g: np.ndarray) -> bool:
+        """Take in x and g = G(x); False if there is no difference to mix with yet."""
+        first = self.count < 0
+        row = max(self.count, 0) % self.memory
+        self.count += 1
+        kept = min(self.count, self.memory)
+        sums = _difference(x, g, self.f, self.g, self.dF, self.dG, row, kept, first)
+        if first:
+            return False
+        self.gram[row, :kept] = self.gram[:kept, row] = sums[:kept]
+        self.rhs[:kept] = sums[kept : 2 * kept]
+        return True
+
+    def _weights(self) -> np.ndarray:
+        """θ of the least-squares problem, from its scaled normal equations with a tiny ridge."""
+        n = min(self.count, self.memory)
+        scale = 1 / np.sqrt(np.maximum(np.diag(self.gram)[:n], 1e-300))
+        A = self.gram[:n, :n] * scale[:, None] * scale + 1e-12 * n * np.eye(n)
+        return scale * np.linalg.lstsq(A, scale * self.rhs[:n], rcond=1e-12)[0]
+
+
+@kernel
+def _difference(x, g, f_before, g_before, dF, dG, row, kept, first):
+    """Store the newest differences in ``row``; returns ΔF_row · ΔF_j, then ΔF_j · f, for j < kept."""
+    n = x.size
+    part = np.zeros(((n + CHUNK - 1) // CHUNK, 2 * kept))
+    for chunk in prange(part.shape[0]):
+        low, high = chunk * CHUNK, min(n, (chunk + 1) * CHUNK)
+        for i in range(low, high):
+            f = g[i] - x[i]
+            if not first:
+                dF[row, i] = f - f_before[i]
+                dG[row, i] = g[i] - g_before[i]
+            f_before[i] = f
+            g_before[i] = g[i]
+        for j in range(kept):
+            a, b = 0.0, 0.0
+            for i in range(low, high):
+                a += dF[row, i] * dF[j, i]
+                b += dF[j, i] * f_before[i]
+            part[chunk, j] = a
+            part[chunk, kept + j] = b
+    return part.sum(0)
+
+
+@kernel
+def _mix(g, dG, theta, out):
+    """out = g - dGᵀ θ."""
+    n = g.size
+    for chunk in prange((n + CHUNK - 1) // CHUNK):
+        low, high = chunk * CHUNK, min(n, (chunk + 1) * CHUNK)
+        for i in range(low, high):
+            out[i] = g[i]
+        for j in range(theta.size):
+            t = theta[j]
+            for i in range(low, high):
+                out[i] -= t * dG[j, i]

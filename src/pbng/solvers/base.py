@@ -1,0 +1,204 @@
+"""What every solver is asked and what it answers: Budget, Status, Result, and the two halves of a solver."""
+
+import enum
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from pbng.errors import InputError
+from pbng.problem import Problem
+
+ITERATION_CAP = 10_000  # where a budget names no other limit
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """When to stop: at the first limit that is met. With no argument, ``Budget(rtol=1e-3)``.
+
+    Args:
+        iterations: At most so many iterations.
+        seconds: At most so many seconds [s], set-up and compilation excluded.
+        rtol: Stop when the residual has fallen to this fraction of the first one.
+        atol: Stop when the residual norm is below this [N].
+        every: Evaluate the residual every so many iterations; it costs about two sweeps.
+    """
+
+    iterations: int | None = None
+    seconds: float | None = None
+    rtol: float | None = None
+    atol: float | None = None
+    every: int = 10
+
+    def __post_init__(self) -> None:
+        for name, low in (("iterations", 0), ("seconds", 0), ("rtol", 0), ("atol", 0), ("every", 1)):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value >= low):
+                raise InputError(f"Budget: {name} must be finite and at least {low}, not {value}")
+        for name in ("iterations", "every"):
+            value = getattr(self, name)
+            if value is not None and int(value) != value:
+                raise InputError(f"Budget: {name} must be a whole number, not {value}")
+        if self.iterations is None and self.seconds is None and self.rtol is None and self.atol is None:
+            object.__setattr__(self, "rtol", 1e-3)
+
+    @property
+    def cap(self) -> int:
+        """The limit on iterations, a generous one if none was given."""
+        return ITERATION_CAP if self.iterations is None else int(self.iterations)
+
+    def tolerance(self, first: float) -> float:
+        """The residual [N] at which to stop when the first one was ``first``; -1 if there is none."""
+        limits = [-1.0]
+        if self.rtol is not None:
+            limits.append(self.rtol * first)
+        if self.atol is not None:
+            limits.append(self.atol)
+        return max(limits)
+
+
+class Status(enum.Enum):
+    """Why a solve ended, as a sentence."""
+
+    CONVERGED = "The residual met the tolerance."
+    ITERATIONS = "The iterations of the budget were used up."
+    SECONDS = "The time of the budget was used up."
+    PRECISION = "The residual reached the rounding floor of float32; ask for dtype='float64' to go below it."
+    DIVERGED = "The state is not finite."
+    INTERRUPTED = "Interrupted; the state is the last one computed."
+
+    def __str__(self) -> str:
+        return self.value
+
+    @property
+    def ok(self) -> bool:
+        """Whether the state is finite and the solve ran to the end of its budget or tolerance."""
+        return self not in (Status.DIVERGED, Status.INTERRUPTED)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A state and its certificate; residuals and energies are float64 whatever the solver computed in.
+
+    Attributes:
+        x: Positions [m], (n_vert, 3), in the precision of the solver.
+        status: Why the solve ended.
+        iterations: Iterations done.
+        residuals: Norms [N] of the total force on free vertices at the monitored iterations, first and last included.
+        energies: Potential energy [J] there.
+        monitored: The numbers of those iterations; the first is 0.
+        force_scale: Sum of the norms of all element forces [N] at the end; what the residual is small against.
+        inverted: Elements with det F < 0 at the end.
+        correction: Largest displacement of a vertex in the last iteration [m].
+        seconds: Time of the iterations [s], monitoring included, set-up and compilation excluded.
+        setup_seconds: Time to set up [s], compilation excluded; zero where a set-up was reused.
+    """
+
+    x: np.ndarray
+    status: Status
+    iterations: int
+    residuals: np.ndarray
+    energies: np.ndarray
+    monitored: np.ndarray
+    force_scale: float
+    inverted: int
+    correction: float
+    seconds: float
+    setup_seconds: float = 0.0
+
+    @property
+    def residual(self) -> float:
+        """The last residual [N]."""
+        return float(self.residuals[-1])
+
+    @property
+    def energy(self) -> float:
+        """The last energy [J]."""
+        return float(self.energies[-1])
+
+    @property
+    def reduction(self) -> float:
+        """The last residual over the first (0 if the first was 0)."""
+        return float(self.residuals[-1] / self.residuals[0]) if self.residuals[0] > 0 else 0.0
+
+    @property
+    def relative_residual(self) -> float:
+        """The last residual over the force scale (0 if that is 0)."""
+        return self.residual / self.force_scale if self.force_scale > 0 else 0.0
+
+    @property
+    def seconds_per_iteration(self) -> float:
+        """Mean time of an iteration [s]."""
+        return self.seconds / max(self.iterations, 1)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The state of a solve in float64: residual [N], energy [J], force scale [N], inverted elements."""
+
+    residual: float
+    energy: float
+    force_scale: float
+    inverted: int
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a monitor is told: iteration, residual and energy there, the tolerance [N] (-1: none), seconds so far."""
+
+    iteration: int
+    residual: float
+    first: float
+    energy: float
+    tolerance: float
+    seconds: float
+
+
+Monitor = Callable[[Progress], Any]
+
+
+class Method(Protocol):
+    """A solver set up for one problem; reused from frame to frame and pose to pose."""
+
+    problem: Problem
+    setup_seconds: float
+
+    def start(self, x: np.ndarray) -> None:
+        """Take x (n_vert, 3) as the state, with the prescribed vertices where they belong."""
+
+    def step(self) -> None:
+        """One iteration."""
+
+    def state(self) -> np.ndarray:
+        """The present positions [m], (n_vert, 3)."""
+
+    def certify(self) -> Certificate:
+        """The present state in float64."""
+
+    def floor(self) -> float:
+        """The residual [N] that rounding the positions to the method's precision may leave."""
+
+
+class Solver(Protocol):
+    """What a user configures: frozen, and good for any number of problems."""
+
+    def set_up(self, problem: Problem) -> Method:
+        """Everything that does not depend on the state."""
+
+
+@dataclass
+class History:
+    """The monitored values of a solve."""
+
+    residuals: list[float] = field(default_factory=list)
+    energies: list[float] = field(default_factory=list)
+    monitored: list[int] = field(default_factory=list)
+    last: Certificate = field(default_factory=lambda: Certificate(math.nan, math.nan, math.nan, 0))
+
+    def add(self, iteration: int, certificate: Certificate) -> None:
+        self.residuals.append(certificate.residual)
+        self.energies.append(certificate.energy)
+        self.monitored.append(iteration)
+        self.last = certificate

@@ -1,0 +1,90 @@
+"""The one loop of all methods: budget, monitoring, status."""
+
+import math
+import time
+
+import numpy as np
+
+from pbng.jit import compile_seconds
+from pbng.solvers.base import Budget, History, Method, Monitor, Progress, Result, Status
+
+
+def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None = None) -> Result:
+    """Iterate from x (n_vert, 3), whose prescribed vertices are in place, until the budget says stop.
+
+    The clock leaves out compilation. Ctrl-C ends the loop with the last state computed.
+    """
+    clock = _Clock()
+    method.start(x)
+    history = History()
+    history.add(0, method.certify())
+    first, floor = history.last.residual, method.floor()
+    tolerance = budget.tolerance(first)
+    status = _verdict(history, tolerance, floor)
+    iteration, correction = 0, 0.0
+    try:
+        while status is None:
+            if iteration >= budget.cap:
+                status = Status.ITERATIONS
+            elif budget.seconds is not None and clock.seconds() >= budget.seconds:
+                status = Status.SECONDS
+            else:
+                due = (iteration + 1) % budget.every == 0
+                before = method.state() if due or iteration + 1 == budget.cap else None
+                method.step()
+                iteration += 1
+                if before is not None:
+                    correction = float(np.abs(method.state() - before).max(initial=0.0))
+                if due:
+                    history.add(iteration, method.certify())
+                    status = _verdict(history, tolerance, floor)
+                    if monitor is not None:
+                        monitor(_progress(history, tolerance, clock.seconds()))
+    except KeyboardInterrupt:
+        status = Status.INTERRUPTED
+    if history.monitored[-1] != iteration:
+        history.add(iteration, method.certify())
+        if status in (Status.ITERATIONS, Status.SECONDS):
+            status = _verdict(history, tolerance, floor) or status
+    return Result(
+        x=method.state(),
+        status=status,
+        iterations=iteration,
+        residuals=np.array(history.residuals),
+        energies=np.array(history.energies),
+        monitored=np.array(history.monitored),
+        force_scale=history.last.force_scale,
+        inverted=history.last.inverted,
+        correction=correction,
+        seconds=clock.seconds(),
+    )
+
+
+def _verdict(history: History, tolerance: float, floor: float) -> Status | None:
+    """Whether the last monitored state ends the loop."""
+    residual = history.last.residual
+    if not (math.isfinite(residual) and math.isfinite(history.last.energy)):
+        return Status.DIVERGED
+    if residual <= tolerance or residual == 0:
+        return Status.CONVERGED
+    # Rounding is what is left once the residual is near its floor and has stopped falling.
+    recent, before = history.residuals[-3:], history.residuals[:-3]
+    if before and residual < 4 * floor and min(recent) > 0.9 * min(before):
+        return Status.PRECISION
+    return None
+
+
+def _progress(history: History, tolerance: float, seconds: float) -> Progress:
+    return Progress(
+        history.monitored[-1], history.residuals[-1], history.residuals[0], history.energies[-1], tolerance, seconds
+    )
+
+
+class _Clock:
+    """Seconds since it was made, less those spent compiling."""
+
+    def __init__(self) -> None:
+        self.start, self.compiled = time.perf_counter(), compile_seconds()
+
+    def seconds(self) -> float:
+        return time.perf_counter() - self.start - (compile_seconds() - self.compiled)

@@ -1,0 +1,133 @@
+"""Position-based nonlinear Gauss-Seidel (section 7): coloured sweeps, accelerated."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numba
+import numpy as np
+
+from pbng.assembly import ElementBlocks
+from pbng.errors import InputError
+from pbng.jit import compile_seconds
+from pbng.packing import pack_problem
+from pbng.problem import Problem
+from pbng.solvers.acceleration import Acceleration, Anderson, Iteration, NodeSOR
+from pbng.solvers.base import Certificate
+from pbng.sweep import sweep
+
+
+@dataclass(frozen=True)
+class PBNG:
+    """The method of the paper, with robust defaults: nothing to tune.
+
+    Args:
+        acceleration: :class:`Anderson` (default), :class:`NodeSOR`, :class:`SOR`, :class:`Chebyshev`, as a class or an
+            instance, or None for plain sweeps. See ``docs/choosing.md``.
+        block: "majorizer", for which no node update can raise the energy, or "paper" for Eq. (32).
+        dtype: Precision of the sweeps, "float32" or "float64"; residuals and energies are always float64.
+        symmetric: Follow each sweep by one in reverse order of the colours (one iteration is then two sweeps).
+        threads: Threads to use; by default all that Numba was given. Use 1 if other work keeps the machine's cores busy.
+        device: Only "cpu".
+    """
+
+    acceleration: Any = field(default_factory=Anderson)
+    block: str = "majorizer"
+    dtype: Any = "float32"
+    symmetric: bool = False
+    threads: int | None = None
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        chosen = NodeSOR(1.0) if self.acceleration is None else self.acceleration
+        chosen = chosen() if isinstance(chosen, type) else chosen
+        if not hasattr(chosen, "start"):
+            raise InputError(f"PBNG: {self.acceleration!r} is not an acceleration")
+        object.__setattr__(self, "acceleration", chosen)
+        if self.block not in ("majorizer", "paper"):
+            raise InputError(f"PBNG: block must be 'majorizer' or 'paper', not {self.block!r}")
+        try:
+            dtype = np.dtype(self.dtype)
+        except TypeError:
+            dtype = np.dtype(object)
+        if dtype not in (np.float32, np.float64):
+            raise InputError(f"PBNG: dtype must be 'float32' or 'float64', not {self.dtype!r}")
+        object.__setattr__(self, "dtype", dtype.name)
+        most = numba.config.NUMBA_NUM_THREADS
+        if self.threads is not None and not 1 <= self.threads <= most:
+            raise InputError(f"PBNG: threads must lie between 1 and {most}, not {self.threads}")
+        if self.device != "cpu":
+            raise InputError(f"PBNG: device must be 'cpu', not {self.device!r}")
+
+    def set_up(self, problem: Problem) -> "PackedMethod":
+        """Colour and pack a problem."""
+        return PackedMethod(problem, self)
+
+
+class PackedMethod:
+    """PBNG set up for one problem: the packed layout, the float64 evaluation and an accelerated state."""
+
+    def __init__(self, problem: Problem, solver: PBNG) -> None:
+        self.problem, self.solver = problem, solver
+        start = time.perf_counter() - compile_seconds()
+        with self._threads():
+            self.packed = pack_problem(problem, np.dtype(solver.dtype), solver.block == "paper")
+            self.blocks = ElementBlocks(problem.groups, problem.X, self.packed.slot, self.packed.n_slot)
+        forward = np.arange(len(self.packed.color_start) - 1)
+        self.colors = np.concatenate([forward, forward[::-1]]) if solver.symmetric else forward
+        self.n_free = self.packed.n_free
+        self.f_ext = np.zeros((self.packed.n_slot, 4))
+        self.f_ext[self.packed.slot, :3] = problem.f_ext
+        self.loaded = bool(self.f_ext.any())
+        self.f_ext = self.f_ext.ravel()
+        self.forces = np.empty(4 * self.packed.n_slot)
+        self.x = self.packed.pack(problem.X)
+        self.iteration: Iteration | None = None
+        self.setup_seconds = time.perf_counter() - compile_seconds() - start
+
+    def start(self, x: np.ndarray) -> None:
+        self.x = self.packed.pack(x)
+        acceleration: Acceleration = self.solver.acceleration
+        self.iteration = acceleration.start(self)
+
+    def step(self) -> None:
+        assert self.iteration is not None, "start() comes first"
+        with self._threads():
+            self.iteration.step(self.x)
+
+    def state(self) -> np.ndarray:
+        return self.packed.unpack(self.x)
+
+    def apply(self, x: np.ndarray, omega: float = 1.0) -> None:
+        sweep(self.packed, x, self.colors, omega)
+
+    def energy(self, x: np.ndarray) -> float:
+        return self.blocks.energy(x) - self._work(x)
+
+    def certify(self) -> Certificate:
+        with self._threads():
+            found = self.blocks.forces(self.x, self.forces)
+            total = self.forces[: self.n_free] + self.f_ext[: self.n_free]
+            energy = found.energy - self._work(self.x)
+        return Certificate(float(np.linalg.norm(total)), energy, found.force_scale, found.inverted)
+
+    def floor(self) -> float:
+        """Norm of the forces that moving each node by half a unit in the last place of the largest position makes."""
+        unit = 0.5 * np.finfo(self.x.dtype).eps * float(np.abs(self.x).max(initial=0.0))
+        return unit * float(np.linalg.norm(self.packed.stiffness()))
+
+    def _work(self, x: np.ndarray) -> float:
+        """Work [J] of the external forces since rest."""
+        return float(self.f_ext @ (x - self.blocks.X)) if self.loaded else 0.0
+
+    @contextmanager
+    def _threads(self) -> Iterator[None]:
+        before = numba.get_num_threads()
+        if self.solver.threads is not None:
+            numba.set_num_threads(self.solver.threads)
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)
