@@ -64,14 +64,16 @@ class ElementBlocks:
 
     def energy(self, x: np.ndarray) -> float:
         """Elastic energy [J] at x, flat (4 n_slot,) with a zero fourth component, of either precision."""
-        return specialised(make_energy, self.terms)(x, self.X, self.blocks, self.idx, self.parameters)
+        parts = specialised(make_energy, self.terms)(x, self.X, self.blocks, self.idx, self.parameters)
+        return float(parts.sum())
 
     def forces(self, x: np.ndarray, f: np.ndarray) -> Evaluation:
         """Write the internal force of every node [N] to f (4 n_slot,) float64; x as for :meth:`energy`."""
         if self._forces is None:
             self._forces = np.empty(3 * len(self.idx))
             self._start, self._place = _places(self.blocks, self.idx, self.n_slot)
-        found = specialised(make_forces, self.terms)(x, self.X, self.blocks, self.idx, self.parameters, self._forces)
+        parts = specialised(make_forces, self.terms)(x, self.X, self.blocks, self.idx, self.parameters, self._forces)
+        found = parts.sum(0)
         _gather(self._start, self._place, self._forces, f)
         return Evaluation(float(found[0]), float(found[1]), int(found[2]))
 
@@ -87,7 +89,7 @@ def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarr
 
 
 def make_energy(key: str):
-    """Kernel of :meth:`ElementBlocks.energy`."""
+    """Kernel of :meth:`ElementBlocks.energy`: the energy of each chunk."""
 
     @njit(parallel=True, cache=True, **FLAGS)
     def energy(x, X, blocks, idx, par):
@@ -101,13 +103,13 @@ def make_energy(key: str):
                 k, p, i, m = blocks[b]
                 total += term_energy(key, k, (m, uint64(i), x, X, idx, par, uint64(p), g, out))
             part[chunk] = total
-        return part.sum()
+        return part
 
     return energy
 
 
 def make_forces(key: str):
-    """Kernel of :meth:`ElementBlocks.forces`."""
+    """Kernel of :meth:`ElementBlocks.forces`: its sums for each chunk."""
 
     @njit(parallel=True, cache=True, **FLAGS)
     def forces(x, X, blocks, idx, par, f):
@@ -124,7 +126,7 @@ def make_forces(key: str):
                 part[chunk, 0] += e
                 part[chunk, 1] += s
                 part[chunk, 2] += inverted
-        return part.sum(0)
+        return part
 
     return forces
 

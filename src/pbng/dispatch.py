@@ -38,11 +38,11 @@ def specialised(make: Callable[[str], Any], terms: tuple[Term, ...]) -> Any:
     return make(key)
 
 
-def _chain(key: str, name: str) -> Any:
-    """``call(k, arguments)`` that runs the function ``name`` of the k-th term: an if-chain, built from its end."""
+def _chain(functions: list[Any]) -> Any:
+    """``call(k, arguments)`` that runs the k-th function: an if-chain, built from its end."""
     call = None
-    for k, (kind, model) in reversed(list(enumerate(_TERMS[key]))):
-        call = _link(k, getattr(kind, name)(model), call)
+    for k, function in reversed(list(enumerate(functions))):
+        call = _link(k, function, call)
     return call
 
 
@@ -82,7 +82,11 @@ def term_forces(key, k, arguments):
 def _overload(stub: Any, name: str) -> None:
     @overload(stub, prefer_literal=True, jit_options={"forceinline": True, **FLAGS})
     def resolve(key, k, arguments):
-        call = _chain(key.literal_value, name)
+        functions = [getattr(kind, name)(model) for kind, model in _TERMS[key.literal_value]]
+        if len(functions) == 1:
+            (only,) = functions
+            return lambda key, k, arguments: only(*arguments)
+        call = _chain(functions)
         return lambda key, k, arguments: call(k, arguments)
 
 

@@ -14,7 +14,7 @@ from numba import njit, prange
 from pbng.assembly import group_parameters
 from pbng.dispatch import specialised, term_pack
 from pbng.elements.base import W
-from pbng.jit import FLAGS, serial
+from pbng.jit import FLAGS, inline, serial
 from pbng.problem import Problem
 
 NODAL = 9  # numbers a node: external force (3), constant part of its Hessian (6, upper triangle)
@@ -233,7 +233,6 @@ def make_fill(key: str):
         owner, real, slot, X, seg_start, seg, cells, group, start, incident, opposite, table, numbers, idx, coef, nodal
     ):
         corners, others = cells.shape[1], opposite.shape[1]
-        unused = np.zeros(NODAL * W)
         for b in prange(seg_start.size - 1):
             for lane in range(W):
                 place = W * b + lane
@@ -242,7 +241,6 @@ def make_fill(key: str):
                 for s in range(seg_start[b], seg_start[b + 1]):
                     which = seg[s, 5]
                     i, c = seg[s, 3] + lane, seg[s, 4] + lane
-                    weight = W * (table[which, 3] // W - 1)
                     end = k
                     while end < start[v + 1] and group[incident[end] // corners] == which:
                         end += 1
@@ -253,14 +251,9 @@ def make_fill(key: str):
                         e, a = q // corners, q % corners
                         for j in range(others):
                             idx[i + W * j] = slot[cells[e, opposite[a, j]]]
-                        if row < n and real[place]:
-                            term_pack(
-                                key, seg[s, 0],
-                                (X, cells, e, a, opposite, coef, c, numbers[which], nodal, (NODAL * b + 3) * W + lane),
-                            )  # fmt: skip
-                        else:
-                            term_pack(key, seg[s, 0], (X, cells, e, a, opposite, coef, c, numbers[which], unused, 0))
-                            coef[c + weight] = 0
+                        once = 1.0 if row < n and real[place] else 0.0
+                        at = (NODAL * b + 3) * W + lane
+                        term_pack(key, seg[s, 0], (X, cells, e, a, opposite, once, coef, c, numbers[which], nodal, at))
                         i += table[which, 2]
                         c += table[which, 3]
                     k = end
@@ -268,7 +261,7 @@ def make_fill(key: str):
     return fill
 
 
-@njit
+@inline
 def _borrowed(owner, b, start, incident, group, corners, which):
     for lane in range(16):
         v = owner[16 * b + lane]

@@ -18,12 +18,14 @@ class Quality:
         n_surface: Triangles of the surface.
         components: Parts that share no vertex.
         size: Extents (x, y, z) of the bounding box [m].
-        volume: Volume [m³] of tets; of triangles, what they enclose, or None if they are not closed.
+        volume: Volume [m³] that the surface encloses, negative if it is turned inside out; None if not watertight.
         area: Area of the surface [m²].
         angle: Smallest, 1st percentile and largest angle [deg]: dihedral angles of tets, corners of triangles. The
             percentile is that of the smallest angle of each cell.
         edge: Shortest, median and longest edge [m].
         shape: Smallest, 1st percentile and median mean-ratio quality of the cells; 1 is regular, 0 is flat.
+        watertight: Whether the surface is closed and consistently oriented: its triangles run along every edge as
+            often one way as the other.
         open_edges: Edges of the surface that belong to one triangle.
         nonmanifold_edges: Edges of the surface that belong to more than two.
     """
@@ -39,18 +41,16 @@ class Quality:
     angle: tuple[float, float, float]
     edge: tuple[float, float, float]
     shape: tuple[float, float, float]
+    watertight: bool
     open_edges: int
     nonmanifold_edges: int
-
-    @property
-    def watertight(self) -> bool:
-        """Whether every edge of the surface belongs to an even number of triangles, at least two."""
-        return self.open_edges == 0
 
     def rows(self) -> list[tuple[str, str]]:
         """(name, value) in words, for a table."""
         angle = "dihedral angles" if self.kind == "tet" else "angles"
-        boundary = "closed" if self.watertight else f"{self.open_edges:,} open edges"
+        boundary = "watertight" if self.watertight else "not consistently oriented"
+        if self.open_edges:
+            boundary = f"{self.open_edges:,} open edges"
         if self.nonmanifold_edges:
             boundary += f", {self.nonmanifold_edges:,} edges of more than two triangles"
         volume = [] if self.volume is None else [("volume", f"{self.volume:.6g} m³")]
@@ -61,9 +61,12 @@ class Quality:
             ("size", " x ".join(f"{s:.4g}" for s in self.size) + " m"),
             *volume,
             ("surface", f"{self.n_surface:,} triangles, {self.area:.6g} m², {boundary}"),
-            ("edges", "{:.3g} to {:.3g} m, median {:.3g} m".format(self.edge[0], self.edge[2], self.edge[1])),
-            (angle, "{:.1f}° to {:.1f}°, 1 % of {}s below {:.1f}°".format(self.angle[0], self.angle[2], self.kind, self.angle[1])),
-            ("shape (mean ratio)", "min {:.3f}, 1 % below {:.3f}, median {:.3f}".format(*self.shape)),
+            ("edges", f"{self.edge[0]:.3g} to {self.edge[2]:.3g} m, median {self.edge[1]:.3g} m"),
+            (angle, f"{self.angle[0]:.1f}° to {self.angle[2]:.1f}°, 1 % of {self.kind}s below {self.angle[1]:.1f}°"),
+            (
+                "shape (mean ratio)",
+                f"min {self.shape[0]:.3f}, 1 % below {self.shape[1]:.3f}, median {self.shape[2]:.3f}",
+            ),
         ]
 
     def __str__(self) -> str:
@@ -83,10 +86,10 @@ def quality(mesh: TetMesh | TriMesh) -> Quality:
     smallest = angles.min(1)
     length = np.linalg.norm(mesh.X[mesh.edges[:, 1]] - mesh.X[mesh.edges[:, 0]], axis=1)
     shape = mean_ratio(mesh.X, mesh.cells)
-    per_edge = triangles_per_edge(mesh.surface)
+    per_edge, balance = triangles_at_edges(mesh.surface)
     corner = mesh.X[mesh.surface]
     area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
-    closed = tets or (per_edge == 2).all()
+    watertight = not balance.any()
     return Quality(
         kind=mesh.cell_name,
         n_vert=mesh.n_vert,
@@ -94,11 +97,12 @@ def quality(mesh: TetMesh | TriMesh) -> Quality:
         n_surface=len(mesh.surface),
         components=int(mesh.component.max()) + 1,
         size=tuple(float(s) for s in np.ptp(mesh.X, axis=0)),  # type: ignore[arg-type]
-        volume=enclosed_volume(mesh.X, mesh.surface) if closed else None,
+        volume=float(cone_volumes(mesh.X, mesh.surface).sum()) if watertight else None,
         area=float(np.linalg.norm(area, axis=1).sum()),
         angle=(float(smallest.min()), float(np.percentile(smallest, 1)), float(angles.max())),
         edge=(float(length.min()), float(np.median(length)), float(length.max())),
         shape=(float(shape.min()), float(np.percentile(shape, 1)), float(np.median(shape))),
+        watertight=watertight,
         open_edges=int((per_edge == 1).sum()),
         nonmanifold_edges=int((per_edge > 2).sum()),
     )
@@ -136,13 +140,19 @@ def mean_ratio(X: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return 2 * np.sqrt(3) * np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1) / total
 
 
-def triangles_per_edge(triangles: np.ndarray) -> np.ndarray:
-    """How many triangles meet at each edge, (n_edge,)."""
-    ends = np.sort(triangles[:, TRIANGLE_EDGES].reshape(-1, 2).astype(np.int64), axis=1)
-    return np.unique(ends[:, 0] << 32 | ends[:, 1], return_counts=True)[1]
+def triangles_at_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many triangles meet at each edge, (n_edge,), and how many more run along it one way than the other."""
+    ends = triangles[:, TRIANGLE_EDGES].reshape(-1, 2).astype(np.int64)
+    low, high = ends.min(1), ends.max(1)
+    _, edge, count = np.unique(low << 32 | high, return_inverse=True, return_counts=True)
+    forward = np.bincount(edge, ends[:, 0] == low).astype(np.int64)
+    return count, 2 * forward - count
 
 
-def enclosed_volume(X: np.ndarray, triangles: np.ndarray) -> float:
-    """Volume [m³] that a closed surface encloses, negative if its normals point inward."""
+def cone_volumes(X: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Signed volumes [m³] between triangles and a common point, (n,); their sum is what a closed surface encloses.
+
+    The sum is negative if the normals point inward.
+    """
     a, b, c = (X[triangles[:, k]] - X[triangles[0, 0]] for k in range(3))
-    return float(np.einsum("ei,ei->", np.cross(a, b), c) / 6)
+    return np.einsum("ei,ei->e", np.cross(a, b), c) / 6

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pbng.jit import serial
+from pbng.jit import inline, serial
 
 # Faces of a positively oriented tet, each ordered so that its normal points outward.
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], np.int32)
@@ -81,7 +81,7 @@ def _match_faces(cells, faces, n_vert):
     return partner, bad
 
 
-@serial
+@inline
 def _rotated(cells, faces, i):
     """The face's vertices, rotated so that the smallest comes first (its orientation is kept)."""
     e, f = i // 4, i % 4
@@ -93,7 +93,7 @@ def _rotated(cells, faces, i):
     return a, b, c
 
 
-@serial
+@inline
 def _opposite(cells, i):
     return cells[i // 4, i % 4]
 
@@ -137,7 +137,7 @@ def components(cells, n_vert):
     return label
 
 
-@serial
+@inline
 def _root(parent, v):
     while parent[v] != v:
         parent[v] = parent[parent[v]]

@@ -6,6 +6,7 @@ fourth zero: reading it too keeps the loads of a lane free of gaps.
 """
 
 from abc import ABC, abstractmethod
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,8 +37,9 @@ class ElementKind(ABC):
 
     @abstractmethod
     def pack(self, model: Model) -> Any:
-        """``(X, cells, e, a, opposite, coef, at, block, nodal, to)``: write the coefficients of corner a of element e
-        to ``coef[at + W * j]`` and add the constant part of its Hessian to ``nodal[to + W * j]``."""
+        """``(X, cells, e, a, opposite, once, coef, at, block, nodal, to)``: write the coefficients of corner a of
+        element e to ``coef[at + W * j]`` and add the constant part of its Hessian to ``nodal[to + W * j]``; ``once`` is
+        1, or 0 for a repeated incidence, which must have no effect."""
 
     @abstractmethod
     def sweep(self, model: Model) -> Any:
@@ -46,11 +48,12 @@ class ElementKind(ABC):
 
     @abstractmethod
     def energy(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, g)``: energy [J] of the first m of the W elements at ``idx[i]``."""
+        """``(m, i, x, X, idx, par, p, g, out)``: energy [J] of the first m of the W elements at ``idx[i]``; g and out
+        are scratch."""
 
     @abstractmethod
     def forces(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, g, f, o)``: the same, with forces on corners written to ``f[o]``; returns
+        """``(m, i, x, X, idx, par, p, g, out, f, o)``: the same, with forces on corners written to ``f[o]``; returns
         the energy, the sum of the norms of the elements' forces [N] and the number of inverted elements."""
 
     @abstractmethod
@@ -81,6 +84,7 @@ def gather(n, i, x, idx, g, to):
         g[q + uint64(3)] = d
 
 
+@cache
 def parameters(n: int) -> Any:
     """``(par, p) -> (par[p], ..., par[p + n - 1])``, as a tuple of scalars."""
     if n == 0:

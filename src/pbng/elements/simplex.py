@@ -7,6 +7,8 @@ freely, so they are turned for each incidence such that the gradient of x's shap
 k give F = [a b e] K with K upper triangular, and a seventh is w = V |g|.
 """
 
+import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ NODE_FRAME, REST_FRAME = 7, 10  # coefficients of an incidence
 zero = uint64(0)
 _1, _2, _3, _4, _5, _6 = (uint64(W * j) for j in range(1, 7))
 _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(7, 12))
+_12, _13, _14 = (uint64(W * j) for j in range(12, 15))
 _Q, _R, _S = (uint64(4 * W * j) for j in range(1, 4))  # second, third, fourth vertex in the scratch array
 
 
@@ -37,11 +40,11 @@ def gradients(a, b, e, share):
 def node_frame(a, b, e, share):
     """The seven coefficients (k0 .. k5, w) of an incidence from its rest edges."""
     one = type(share)(1)
-    la = dot(a, a) ** 0.5
+    la = math.sqrt(dot(a, a))
     u = scale(one / la, a)
     bu = dot(b, u)
     t = sub(b, scale(bu, u))
-    lt = dot(t, t) ** 0.5
+    lt = math.sqrt(dot(t, t))
     v = scale(one / lt, t)
     h = dot(e, cross(u, v))
     k0 = one / la
@@ -90,6 +93,7 @@ class Simplex(ElementKind):
         """Volume over det [a b e]."""
         return 1 / 2 if self.plane else 1 / 6
 
+    @cache
     def _edges(self) -> Any:
         """``(g, j, x) -> a, b, e`` from the scratch array at lane position j and the last corner x."""
         if self.plane:
@@ -107,17 +111,18 @@ class Simplex(ElementKind):
 
         return edges
 
+    @cache
     def pack(self, model: Model) -> Any:
         plane, isotropic, share = self.plane, model.isotropic, self.share
 
         @inline
-        def pack(X, cells, e, a, opposite, coef, at, block, nodal, to):
+        def pack(X, cells, e, a, opposite, once, coef, at, block, nodal, to):
             p = corner(X, cells[e, opposite[a, 0]])
             ea = sub(corner(X, cells[e, opposite[a, 1]]), p)
             eb = (0.0, 0.0, 1.0) if plane else sub(corner(X, cells[e, opposite[a, -1]]), p)
             ee = sub(corner(X, cells[e, a]), p)
-            ga, gb, ge, V = gradients(ea, eb, ee, share)
-            k = node_frame(ea, eb, ee, share) if isotropic else (*ga, *gb, *ge, V)
+            ga, gb, ge, V = gradients(ea, eb, ee, once * share)
+            k = node_frame(ea, eb, ee, once * share) if isotropic else (*ga, *gb, *ge, V)
             for j in range(len(k)):
                 coef[at + W * j] = k[j]
             s = V * block[0] * dot(ge, ge)
@@ -131,6 +136,7 @@ class Simplex(ElementKind):
 
         return pack
 
+    @cache
     def sweep(self, model: Model) -> Any:
         others = self.others
         incidence = self._incidence(model)
@@ -161,6 +167,7 @@ class Simplex(ElementKind):
 
         return sweep
 
+    @cache
     def _incidence(self, model: Model) -> Any:
         """``(g, j, x, coef, c, b, m) -> V P g, h, v``: a node's negative force and the term h v vᵀ of its Hessian."""
         edges, stress = self._edges(), model.stress
@@ -187,6 +194,7 @@ class Simplex(ElementKind):
 
         return incidence
 
+    @cache
     def _element(self) -> Any:
         """``(g, j) -> F, ga, gb, ge, V`` from the scratch array: current positions, then rest positions."""
         edges, share, last = self._edges(), self.share, _R if self.plane else _S
@@ -201,35 +209,37 @@ class Simplex(ElementKind):
 
         return element
 
+    @cache
     def energy(self, model: Model) -> Any:
         corners, element, psi = self.corners, self._element(), model.energy
         numbers = parameters(model.n_parameters)
-        rest, out = uint64(4 * W * corners), uint64(8 * W * corners)
+        rest = uint64(4 * W * corners)
 
         @inline
-        def energy(m, i, x, X, idx, par, p, g):
+        def energy(m, i, x, X, idx, par, p, g, out):
             number = numbers(par, p + uint64(1))
             gather(corners, i, x, idx, g, zero)
             gather(corners, i, X, idx, g, rest)
             for l_ in range(W):
                 l = uint64(l_)
                 F, ga, gb, ge, V = element(g, l * uint64(4))
-                g[out + l] = V * psi(F, *number)
+                out[l] = V * psi(F, *number)
             total = 0.0
             for l_ in range(m):
-                total += g[out + uint64(l_)]
+                total += out[uint64(l_)]
             return total
 
         return energy
 
+    @cache
     def forces(self, model: Model) -> Any:
         corners, element, psi, stress, plane = self.corners, self._element(), model.energy, model.stress, self.plane
         numbers = parameters(model.n_parameters)
-        rest, out = uint64(4 * W * corners), uint64(8 * W * corners)
-        last = _6 if plane else _9
+        rest = uint64(4 * W * corners)
+        last = _6 if plane else _9  # where the force on the last corner goes
 
         @inline
-        def forces(m, i, x, X, idx, par, p, g, f, o):
+        def forces(m, i, x, X, idx, par, p, g, out, f, o):
             number = numbers(par, p + uint64(1))
             gather(corners, i, x, idx, g, zero)
             gather(corners, i, X, idx, g, rest)
@@ -241,24 +251,25 @@ class Simplex(ElementKind):
                 fb = scale(-V, mat_vec(P, gb))
                 fe = scale(-V, mat_vec(P, ge))
                 fp = scale(-1.0, add(fa, fe)) if plane else scale(-1.0, add(add(fa, fb), fe))
-                t = o + l
-                f[t], f[t + _1], f[t + _2] = fp
-                f[t + _3], f[t + _4], f[t + _5] = fa
-                if not plane:
-                    f[t + _6], f[t + _7], f[t + _8] = fb
-                f[t + last], f[t + last + _1], f[t + last + _2] = fe
                 norm2 = dot(fp, fp) + dot(fa, fa) + dot(fe, fe)
+                out[l], out[_1 + l], out[_2 + l] = fp
+                out[_3 + l], out[_4 + l], out[_5 + l] = fa
                 if not plane:
+                    out[_6 + l], out[_7 + l], out[_8 + l] = fb
                     norm2 += dot(fb, fb)
-                g[out + l] = V * psi(F, *number)
-                g[out + _1 + l] = norm2**0.5
-                g[out + _2 + l] = det(F)
+                out[last + l], out[last + _1 + l], out[last + _2 + l] = fe
+                out[_12 + l] = V * psi(F, *number)
+                out[_13 + l] = math.sqrt(norm2)
+                out[_14 + l] = det(F)
+            for l_ in range(3 * corners * W):
+                l = uint64(l_)
+                f[o + l] = out[l]
             total, size, inverted = 0.0, 0.0, 0
             for l_ in range(m):
                 l = uint64(l_)
-                total += g[out + l]
-                size += g[out + _1 + l]
-                inverted += g[out + _2 + l] < 0.0
+                total += out[_12 + l]
+                size += out[_13 + l]
+                inverted += out[_14 + l] < 0.0
             return total, size, inverted
 
         return forces

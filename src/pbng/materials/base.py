@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 from typing import Any, ClassVar, NamedTuple, TypeVar, dataclass_transform
 
 from pbng.errors import InputError
-from pbng.jit import fingerprint, inline
+from pbng.jit import fingerprint, function
 
 
 class Block(NamedTuple):
@@ -105,10 +105,10 @@ def model_of(cls: type[Material], n_parameters: int) -> Model:
 
 
 def _compiled(cls: type[Material], name: str) -> Callable[..., Any]:
-    function = getattr(cls, name, None)
-    if function is None:
+    own = getattr(cls, name, None)
+    if own is None:
         raise InputError(f"material {cls.__name__} defines no {name}(F, *parameters)")
-    return function if hasattr(function, "py_func") else inline(function)
+    return own if hasattr(own, "py_func") else function(own)
 
 
 M = TypeVar("M", bound=type)
@@ -127,6 +127,6 @@ def material(cls: M) -> M:
     for name in ("energy", "stress"):
         own = vars(cls).get(name)
         if own is not None:
-            function = own.__func__ if isinstance(own, staticmethod) else own
-            setattr(cls, name, staticmethod(function if hasattr(function, "py_func") else inline(function)))
+            plain = own.__func__ if isinstance(own, staticmethod) else own
+            setattr(cls, name, staticmethod(plain if hasattr(plain, "py_func") else function(plain)))
     return dataclass(frozen=True, kw_only=True)(cls)

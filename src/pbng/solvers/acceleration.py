@@ -176,7 +176,7 @@ class _Mixing:
         row = max(self.count, 0) % self.memory
         self.count += 1
         kept = min(self.count, self.memory)
-        sums = _difference(x, g, self.f, self.g, self.dF, self.dG, row, kept, first)
+        sums = _difference(x, g, self.f, self.g, self.dF, self.dG, row, kept).sum(0)
         if first:
             return False
         self.gram[row, :kept] = self.gram[:kept, row] = sums[:kept]
@@ -192,17 +192,16 @@ class _Mixing:
 
 
 @kernel
-def _difference(x, g, f_before, g_before, dF, dG, row, kept, first):
-    """Store the newest differences in ``row``; returns ΔF_row · ΔF_j, then ΔF_j · f, for j < kept."""
+def _difference(x, g, f_before, g_before, dF, dG, row, kept):
+    """Store the newest differences in ``row``; returns ΔF_row · ΔF_j, then ΔF_j · f, for j < kept, by chunks."""
     n = x.size
     part = np.zeros(((n + CHUNK - 1) // CHUNK, 2 * kept))
     for chunk in prange(part.shape[0]):
         low, high = chunk * CHUNK, min(n, (chunk + 1) * CHUNK)
         for i in range(low, high):
             f = g[i] - x[i]
-            if not first:
-                dF[row, i] = f - f_before[i]
-                dG[row, i] = g[i] - g_before[i]
+            dF[row, i] = f - f_before[i]  # means nothing on the first call after a restart: it is overwritten
+            dG[row, i] = g[i] - g_before[i]
             f_before[i] = f
             g_before[i] = g[i]
         for j in range(kept):
@@ -212,7 +211,7 @@ def _difference(x, g, f_before, g_before, dF, dG, row, kept, first):
                 b += dF[j, i] * f_before[i]
             part[chunk, j] = a
             part[chunk, kept + j] = b
-    return part.sum(0)
+    return part
 
 
 @kernel
