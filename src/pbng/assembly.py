@@ -45,7 +45,7 @@ class ElementBlocks:
         self.parameters, first = group_parameters(groups, np.float64)
         idx, blocks, at = [], [], 0
         for number, group in enumerate(groups):
-            cells = slot[group.cells][:, group.term.kind.order].astype(np.uint32)
+            cells = (4 * slot[group.cells][:, group.term.kind.order]).astype(np.uint32)
             cells = cells[np.argsort(morton(X[group.cells].mean(1)), kind="stable")]
             n, corners = cells.shape
             n_block = -(-n // W)
@@ -140,7 +140,7 @@ def _places(blocks, idx, n_slot):
         end = blocks[b + 1, 2] if b + 1 < blocks.shape[0] else idx.size
         for i in range(first, end):
             if (i - first) % W < m:
-                start[idx[i] + 1] += 1
+                start[idx[i] // 4 + 1] += 1
     for v in range(n_slot):
         start[v + 1] += start[v]
     position = start[:-1].copy()
@@ -151,7 +151,7 @@ def _places(blocks, idx, n_slot):
         for i in range(first, end):
             lane = (i - first) % W
             if lane < m:
-                v = idx[i]
+                v = idx[i] // 4
                 place[position[v]] = 3 * first + (i - first) // W * (3 * W) + lane
                 position[v] += 1
     return start, place

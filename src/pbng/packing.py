@@ -31,7 +31,7 @@ class Packed:
         color_start: First block of each colour, (n_color + 1,).
         seg_start: First segment of each block, (n_block + 1,).
         seg: For each segment: term, place of the parameters, rows, place in ``idx``, place in ``coef``, (n, 5).
-        idx, coef: The rows: other corners (slots) and coefficients, flat, lane fastest.
+        idx, coef: The rows: places of the other corners in a flat position array, and coefficients; flat, lane fastest.
         nodal: External force and constant Hessian of the nodes, flat (n_block, NODAL, W).
         parameters: Numbers of the groups' materials, flat.
     """
@@ -83,7 +83,8 @@ class Packed:
 def aligned(n: int, dtype) -> np.ndarray:
     """Zeros (n,) that begin at a cache line."""
     size = np.dtype(dtype).itemsize
-    raw = np.zeros(n * size + 64, np.uint8)
+    raw = np.empty(n * size + 64, np.uint8)  # not np.zeros: NumPy asks for huge pages only when it allocates plainly
+    raw[:] = 0
     shift = -raw.ctypes.data % 64
     return raw[shift : shift + n * size].view(dtype)
 
@@ -247,10 +248,14 @@ def make_fill(key: str):
                     n = end - k
                     for row in range(seg[s, 2]):
                         # A lane without an incidence in this segment borrows the first of the segment's group.
-                        q = incident[k + min(row, n - 1)] if n else _borrowed(owner, b, start, incident, group, corners, which)
+                        q = (
+                            incident[k + min(row, n - 1)]
+                            if n
+                            else _borrowed(owner, b, start, incident, group, corners, which)
+                        )
                         e, a = q // corners, q % corners
                         for j in range(others):
-                            idx[i + W * j] = slot[cells[e, opposite[a, j]]]
+                            idx[i + W * j] = 4 * slot[cells[e, opposite[a, j]]]
                         once = 1.0 if row < n and real[place] else 0.0
                         at = (NODAL * b + 3) * W + lane
                         term_pack(key, seg[s, 0], (X, cells, e, a, opposite, once, coef, c, numbers[which], nodal, at))

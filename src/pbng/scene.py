@@ -162,7 +162,9 @@ class Scene:
         if len(selection) == 0:
             low, high = selection.body.mesh.X.min(0), selection.body.mesh.X.max(0)
             spans = ", ".join(f"{a} in [{l:g}, {h:g}]" for a, l, h in zip("xyz", low, high))
-            raise InputError(f"{what}: {selection.body.name}.where({selection.words}) selects no vertex; it has {spans}")
+            raise InputError(
+                f"{what}: {selection.body.name}.where({selection.words}) selects no vertex; it has {spans}"
+            )
         return selection.index
 
     def compile(self) -> Problem:
@@ -256,12 +258,16 @@ def _materials(name: str, mesh: Mesh, material: Any) -> tuple[tuple[Material, np
     if isinstance(material, Material):
         return ((material, np.arange(mesh.n_elem)),)
     if not isinstance(material, Mapping) or not material:
-        raise InputError(f"body {name!r}: expected a material or a mapping of cell groups to materials, not {material!r}")
+        raise InputError(
+            f"body {name!r}: expected a material or a mapping of cell groups to materials, not {material!r}"
+        )
     times = np.zeros(mesh.n_elem, int)
     parts = []
     for group, m in material.items():
         if group not in mesh.cell_groups:
-            raise InputError(f"body {name!r}: no cell group {group!r}; the mesh has {sorted(mesh.cell_groups) or 'none'}")
+            raise InputError(
+                f"body {name!r}: no cell group {group!r}; the mesh has {sorted(mesh.cell_groups) or 'none'}"
+            )
         if not isinstance(m, Material):
             raise InputError(f"body {name!r}: cell group {group!r} needs a material, not {m!r}")
         times[mesh.cell_groups[group]] += 1

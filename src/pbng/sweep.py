@@ -8,15 +8,14 @@ One sub-iterate, Eqs. (28)-(34), for the 16 nodes of a block at once::
 """
 
 import numpy as np
-from numba import njit, prange, uint64
+from numba import get_num_threads, njit, prange, uint64
 
 from pbng.dispatch import specialised, term_sweep
-from pbng.elements.base import W
+from pbng.elements.base import AHEAD, W
 from pbng.jit import FLAGS, inline
 from pbng.linalg import solve_spd
 from pbng.packing import NODAL, Packed
 
-GRAIN = 16  # blocks a thread takes at a time
 _1, _2, _3, _4, _5, _6 = (uint64(W * j) for j in range(1, 7))
 _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(7, 12))
 
@@ -32,22 +31,38 @@ def sweep(packed: Packed, x: np.ndarray, colors: np.ndarray, omega: float = 1.0)
     """
     p = packed
     specialised(make_sweep, p.terms)(
-        x, colors, p.color_start, p.seg_start, p.seg, p.idx, p.coef, p.nodal, p.parameters, p.dtype.type(omega)
+        x,
+        colors,
+        p.color_start,
+        p.seg_start,
+        p.seg,
+        p.idx,
+        p.coef,
+        p.nodal,
+        p.parameters,
+        p.dtype.type(omega),
+        _grain(p),
     )
+
+
+def _grain(packed: Packed) -> int:
+    """Blocks a thread takes at a time: several helpings a thread and colour, to even out, but not too small ones."""
+    a_color = packed.n_block / max(len(packed.color_start) - 1, 1)
+    return int(min(max(a_color / (8 * get_num_threads()), 4), 64))
 
 
 def make_sweep(key: str):
     """Kernel of :func:`sweep`."""
 
     @njit(parallel=True, cache=True, **FLAGS)
-    def run(x, colors, color_start, seg_start, seg, idx, coef, nodal, par, omega):
+    def run(x, colors, color_start, seg_start, seg, idx, coef, nodal, par, omega, grain):
         for n in range(colors.size):
             low = color_start[colors[n]]
             high = color_start[colors[n] + 1]
-            for chunk in prange((high - low + GRAIN - 1) // GRAIN):
-                g = np.empty(12 * W, x.dtype)
-                acc = np.empty(12 * W, x.dtype)
-                for b in range(low + chunk * GRAIN, min(high, low + (chunk + 1) * GRAIN)):
+            for chunk in prange((high - low + grain - 1) // grain):
+                g = _scratch(np.empty(12 * W * AHEAD + W, x.dtype))
+                acc = _scratch(np.empty(12 * W + W, x.dtype))
+                for b in range(low + chunk * grain, min(high, low + (chunk + 1) * grain)):
                     _load(uint64(b), x, nodal, acc)
                     for s in range(seg_start[b], seg_start[b + 1]):
                         k, p, rows, i, c = seg[s]
@@ -58,16 +73,28 @@ def make_sweep(key: str):
 
 
 @inline
+def _scratch(a):
+    """The part of a that begins at a cache line."""
+    return a[(64 - a.ctypes.data % 64) % 64 // a.itemsize :]
+
+
+@inline
 def _load(b, x, nodal, acc):
     """Start a block: external forces and constant Hessians (rows 0-8 of acc), positions (rows 9-11)."""
     n = b * uint64(NODAL * W)
-    for l_ in range(NODAL * W):
-        l = uint64(l_)
-        acc[l] = nodal[n + l]
     at = b * uint64(4 * W)
     for l_ in range(W):
         l = uint64(l_)
         i = at + uint64(4) * l
+        acc[l] = nodal[n + l]
+        acc[_1 + l] = nodal[n + _1 + l]
+        acc[_2 + l] = nodal[n + _2 + l]
+        acc[_3 + l] = nodal[n + _3 + l]
+        acc[_4 + l] = nodal[n + _4 + l]
+        acc[_5 + l] = nodal[n + _5 + l]
+        acc[_6 + l] = nodal[n + _6 + l]
+        acc[_7 + l] = nodal[n + _7 + l]
+        acc[_8 + l] = nodal[n + _8 + l]
         acc[_9 + l] = x[i]
         acc[_10 + l] = x[i + uint64(1)]
         acc[_11 + l] = x[i + uint64(2)]
@@ -81,8 +108,17 @@ def _step(b, x, acc, omega):
         l = uint64(l_)
         i = at + uint64(4) * l
         dx, dy, dz = solve_spd(
-            acc[_3 + l], acc[_4 + l], acc[_5 + l], acc[_6 + l], acc[_7 + l], acc[_8 + l], acc[l], acc[_1 + l], acc[_2 + l]
+            acc[_3 + l],
+            acc[_4 + l],
+            acc[_5 + l],
+            acc[_6 + l],
+            acc[_7 + l],
+            acc[_8 + l],
+            acc[l],
+            acc[_1 + l],
+            acc[_2 + l],
         )
         x[i] = acc[_9 + l] + omega * dx
         x[i + uint64(1)] = acc[_10 + l] + omega * dy
         x[i + uint64(2)] = acc[_11 + l] + omega * dz
+        x[i + uint64(3)] = omega - omega  # stays zero; without a gap LLVM stores whole vectors

@@ -16,6 +16,8 @@ from pbng.jit import inline
 from pbng.materials.base import Model
 
 W = 16  # lanes: float32 fills one AVX-512 register; float64 is as fast with 16 as with 8
+AHEAD = 6  # rows gathered before they are computed: the accumulators then stay in registers for so many rows, and no
+# load waits for the narrower stores that it spans
 
 
 class ElementKind(ABC):
@@ -69,10 +71,10 @@ def vec(g, j):
 
 @inline
 def gather(n, i, x, idx, g, to):
-    """Copy the n * W positions that ``idx[i:]`` names to ``g[to:]``."""
+    """Copy n * W positions to ``g[to:]``; ``idx[i:]`` holds their places in x, which are multiples of 4."""
     for l_ in range(n * W):
         l = uint64(l_)
-        p = uint64(idx[i + l]) * uint64(4)
+        p = uint64(idx[i + l])
         q = to + l * uint64(4)
         a = x[p]
         b = x[p + uint64(1)]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import uint64
 
-from pbng.elements.base import ElementKind, W, gather, parameters, vec
+from pbng.elements.base import AHEAD, ElementKind, W, gather, parameters, vec
 from pbng.jit import fingerprint, inline
 from pbng.linalg import add, cofactor, combine, combine3, cross, det, dot, mat_vec, scale, sub
 from pbng.materials.base import Model
@@ -141,29 +141,33 @@ class Simplex(ElementKind):
         others = self.others
         incidence = self._incidence(model)
         numbers = parameters(model.n_parameters)
-        idx_row, coef_row = uint64(W * others), uint64(W * self.width(model))
+        idx_row, coef_row, positions = uint64(W * others), uint64(W * self.width(model)), uint64(4 * W * others)
 
         @inline
         def sweep(n, i, c, x, idx, coef, par, p, g, acc):
             b = par[p]
             m = numbers(par, p + uint64(1))
-            for _ in range(n):
-                gather(others, i, x, idx, g, zero)
-                for l_ in range(W):
-                    l = uint64(l_)
-                    f, h, v = incidence(g, l * uint64(4), (acc[_9 + l], acc[_10 + l], acc[_11 + l]), coef, c + l, b, m)
-                    acc[l] -= f[0]
-                    acc[_1 + l] -= f[1]
-                    acc[_2 + l] -= f[2]
-                    u = scale(h, v)
-                    acc[_3 + l] += u[0] * v[0]
-                    acc[_4 + l] += u[0] * v[1]
-                    acc[_5 + l] += u[0] * v[2]
-                    acc[_6 + l] += u[1] * v[1]
-                    acc[_7 + l] += u[1] * v[2]
-                    acc[_8 + l] += u[2] * v[2]
-                i += idx_row
-                c += coef_row
+            for first in range(0, n, AHEAD):
+                rows = min(AHEAD, n - first)
+                gather(rows * others, i, x, idx, g, zero)
+                i += uint64(rows) * idx_row
+                for row in range(rows):
+                    here = uint64(row) * positions
+                    for l_ in range(W):
+                        l = uint64(l_)
+                        xl = (acc[_9 + l], acc[_10 + l], acc[_11 + l])
+                        f, h, v = incidence(g, here + l * uint64(4), xl, coef, c + l, b, m)
+                        acc[l] -= f[0]
+                        acc[_1 + l] -= f[1]
+                        acc[_2 + l] -= f[2]
+                        u = scale(h, v)
+                        acc[_3 + l] += u[0] * v[0]
+                        acc[_4 + l] += u[0] * v[1]
+                        acc[_5 + l] += u[0] * v[2]
+                        acc[_6 + l] += u[1] * v[1]
+                        acc[_7 + l] += u[1] * v[2]
+                        acc[_8 + l] += u[2] * v[2]
+                    c += coef_row
 
         return sweep
 

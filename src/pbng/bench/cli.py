@@ -1,0 +1,130 @@
+"""The ``pbng bench`` commands."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+app = typer.Typer(help="Measure: time of a sweep, convergence.", no_args_is_help=True)
+console = Console()
+
+
+@app.command("sweep")
+def sweep_command(
+    n: Annotated[list[int], typer.Option("--n", help="Vertices along an edge of the block.")] = [32, 64],  # noqa: B006
+    delaunay: Annotated[int, typer.Option(help="Vertices along an edge of the random-order mesh; 0 for none.")] = 33,
+    model: Annotated[list[str], typer.Option(help="Models to measure.")] = ["corotated", "neo-hookean"],  # noqa: B006
+    threads: Annotated[list[int], typer.Option(help="Numbers of threads.")] = [1, 2],  # noqa: B006
+    dtype: str = "float32",
+    rounds: int = 15,
+    reference: Annotated[Path | None, typer.Option(help="Folder of an implementation to compare with.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+) -> None:
+    """Time a sweep of PBNG, in one run with a reference implementation if one is given."""
+    from pbng.bench import sweep
+
+    cases = [("box", m) for m in n] + ([("delaunay", delaunay)] if delaunay else [])
+    rows = sweep.measure(cases, model, threads, dtype, rounds, reference)
+    show(
+        f"One sweep, {dtype}, median of {rounds} rounds",
+        [
+            Column("mesh", "mesh"),
+            Column("tets", "tets", "{:,}"),
+            Column("model", "model"),
+            Column("threads", "threads"),
+            Column("ms", "ms", "{:.2f}"),
+            Column("best", "best_ms", "{:.2f}"),
+            Column("ns/tet", "ns_per_tet", "{:.1f}"),
+            Column("paper, 8 threads", "paper_ns"),
+            Column("/ reference", "ratio", "{:.2f}"),
+            Column("best / best", "best_ratio", "{:.2f}"),
+            Column("set-up [s]", "setup_s", "{:.2f}"),
+            Column("layout [MB]", "layout_MB", "{:.0f}"),
+            Column("peak [MB]", "peak_MB", "{:.0f}"),
+        ],
+        rows,
+    )
+    write(record, "sweep", rows)
+
+
+@app.command("convergence")
+def convergence_command(
+    n: Annotated[list[int], typer.Option("--n", help="Vertices along an edge of the block.")] = [32],  # noqa: B006
+    model: Annotated[list[str], typer.Option(help="Models to measure.")] = [  # noqa: B006
+        "corotated",
+        "neo-hookean",
+        "stable-neo-hookean",
+    ],
+    nu: Annotated[list[float], typer.Option(help="Poisson's ratios.")] = [0.3],  # noqa: B006
+    sweeps: int = 200,
+    every: int = 10,
+    dtype: str = "float64",
+    out: Annotated[Path | None, typer.Option(help="Folder for plots.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+) -> None:
+    """Residual against sweeps: a block turned by 90° and stretched by half in one step, from rest."""
+    from pbng.bench import convergence
+
+    rows = []
+    for m in n:
+        for name in model:
+            for v in nu:
+                results = convergence.measure(m, name, v, sweeps, every, dtype)
+                for acceleration, r in results.items():
+                    row: dict[str, Any] = {"n": m, "model": name, "nu": v, "acceleration": acceleration}
+                    row |= {f"{level:.0e}": convergence.sweeps_to(r, level) for level in convergence.LEVELS}
+                    row |= {"last": r.reduction, "ms": r.seconds_per_iteration * 1e3, "status": r.status.name}
+                    row["ratios"] = convergence.ratios(r).tolist()
+                    rows.append(row)
+                if out is not None:
+                    from pbng.view import plot_residuals
+
+                    out.mkdir(parents=True, exist_ok=True)
+                    plot_residuals(
+                        {k: (r.monitored, convergence.ratios(r)) for k, r in results.items()},
+                        out / f"convergence_{m}_{name}_{v}.png",
+                        xlabel="sweeps",
+                        ylabel="residual / first residual",
+                        title=f"{m}³ vertices, {name}, ν = {v}",
+                    )
+    levels = [Column(f"{level:.0e}", f"{level:.0e}") for level in convergence.LEVELS]
+    show(
+        f"Sweeps to a residual ratio, {dtype}",
+        [Column(c, c) for c in ("n", "model", "nu", "acceleration")]
+        + levels
+        + [Column(f"after {sweeps}", "last", "{:.1e}"), Column("ms/sweep", "ms", "{:.2f}")],
+        rows,
+    )
+    write(record, "convergence", rows)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: heading, key of the row, format."""
+
+    heading: str
+    key: str
+    form: str = "{}"
+
+
+def show(title: str, columns: list[Column], rows: list[dict[str, Any]]) -> None:
+    """Print rows as a table; columns that no row has are left out."""
+    columns = [c for c in columns if any(r.get(c.key) is not None for r in rows)]
+    table = Table(title=title)
+    for c in columns:
+        table.add_column(c.heading, justify="left" if isinstance(rows[0].get(c.key), str) else "right")
+    for r in rows:
+        table.add_row(*("-" if r.get(c.key) is None else c.form.format(r[c.key]) for c in columns))
+    console.print(table)
+
+
+def write(path: Path | None, name: str, rows: list[dict[str, Any]]) -> None:
+    """Write a record with the machine it was measured on."""
+    if path is not None:
+        from pbng.bench.timing import machine
+
+        path.write_text(json.dumps({"benchmark": name, "machine": machine(), "rows": rows}, indent=1))
