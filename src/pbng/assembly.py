@@ -43,10 +43,12 @@ class ElementBlocks:
         self.X = self.X.ravel()
         self.terms = tuple(dict.fromkeys(g.term for g in groups))
         self.parameters, first = group_parameters(groups, np.float64)
+        rank = np.empty(len(X), np.int64)
+        rank[np.argsort(morton(X), kind="stable")] = np.arange(len(X))
         idx, blocks, at = [], [], 0
         for number, group in enumerate(groups):
             cells = (4 * slot[group.cells][:, group.term.kind.order]).astype(np.uint32)
-            cells = cells[np.argsort(morton(X[group.cells].mean(1)), kind="stable")]
+            cells = cells[np.argsort(rank[group.cells].min(1), kind="stable")]  # neighbours in space stay neighbours
             n, corners = cells.shape
             n_block = -(-n // W)
             padded = np.concatenate([cells, np.repeat(cells[-1:], n_block * W - n, axis=0)])
@@ -96,12 +98,12 @@ def make_energy(key: str):
         n = blocks.shape[0]
         part = np.zeros((n + CHUNK - 1) // CHUNK)
         for chunk in prange(part.size):
-            g = np.empty(32 * W)
+            gx, gX = np.empty(16 * W, x.dtype), np.empty(16 * W)
             out = np.empty(W)
             total = 0.0
             for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
                 k, p, i, m = blocks[b]
-                total += term_energy(key, k, (m, uint64(i), x, X, idx, par, uint64(p), g, out))
+                total += term_energy(key, k, (m, uint64(i), x, X, idx, par, uint64(p), gx, gX, out))
             part[chunk] = total
         return part
 
@@ -116,12 +118,12 @@ def make_forces(key: str):
         n = blocks.shape[0]
         part = np.zeros(((n + CHUNK - 1) // CHUNK, 3))
         for chunk in prange(part.shape[0]):
-            g = np.empty(32 * W)
+            gx, gX = np.empty(16 * W, x.dtype), np.empty(16 * W)
             out = np.empty(15 * W)
             for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
                 k, p, i, m = blocks[b]
                 e, s, inverted = term_forces(
-                    key, k, (m, uint64(i), x, X, idx, par, uint64(p), g, out, f, uint64(3) * uint64(i))
+                    key, k, (m, uint64(i), x, X, idx, par, uint64(p), gx, gX, out, f, uint64(3) * uint64(i))
                 )
                 part[chunk, 0] += e
                 part[chunk, 1] += s

@@ -154,13 +154,14 @@ def _stretch_trace(I1, I2, J):
 
 @overload(_stretch_trace, jit_options={"forceinline": True, **FLAGS})
 def _(I1, I2, J):
-    """tr S to rounding: three steps in float32; in float64 as many with float32's cheap divisions, then three more."""
+    """tr S to rounding: three steps in float32; in float64 as many with float32's cheap divisions, then two more."""
     if I1 == types.float32:
         return lambda I1, I2, J: _halley_thrice(_trace_bound(I1, I2, J), I1, I2, J)
 
     def double(I1, I2, J):
         i1, i2, j = np.float32(I1), np.float32(I2), np.float32(J)
-        return _halley_thrice(np.float64(_halley_thrice(_trace_bound(i1, i2, j), i1, i2, j)), I1, I2, J)
+        s = np.float64(_halley_thrice(_trace_bound(i1, i2, j), i1, i2, j))
+        return _halley(_halley(s, I1, I2, J), I1, I2, J)
 
     return double
 

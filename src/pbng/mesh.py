@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pbng.errors import InputError
+from pbng.jit import serial
 from pbng.topology import TET_EDGES, TRIANGLE_EDGES, components, tet_faces, unique_edges
 
 log = logging.getLogger("pbng")
@@ -201,9 +202,7 @@ class TetMesh(Mesh):
     cell_name = "tet"
 
     def _oriented(self, X: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        volume = tet_volumes(X, cells)
-        edge = X[cells[:, TET_EDGES[:, 1]]] - X[cells[:, TET_EDGES[:, 0]]]
-        longest = np.sqrt(np.einsum("eij,eij->ei", edge, edge).max(1))
+        volume, longest = _measure_tets(X, cells)
         self._degenerate(np.abs(volume) <= 1e-12 * longest**3, "have zero volume")
         flipped = np.flatnonzero(volume < 0)
         cells[flipped] = cells[flipped][:, [0, 1, 3, 2]]
@@ -291,8 +290,28 @@ class TriMesh(Mesh):
 
 def tet_volumes(X: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Signed volume [m³] of tets, (n_elem,)."""
-    a, b, c = (X[cells[:, k]] - X[cells[:, 0]] for k in (1, 2, 3))
-    return np.einsum("ei,ei->e", np.cross(a, b), c) / 6
+    return _measure_tets(X, cells)[0]
+
+
+@serial
+def _measure_tets(X, cells):
+    """Signed volume and longest edge of each tet."""
+    volume, longest = np.empty(len(cells)), np.empty(len(cells))
+    e = np.empty((6, 3))
+    for n in range(len(cells)):
+        for k in range(3):
+            a, b, c, d = X[cells[n, 0], k], X[cells[n, 1], k], X[cells[n, 2], k], X[cells[n, 3], k]
+            e[0, k], e[1, k], e[2, k], e[3, k], e[4, k], e[5, k] = b - a, c - a, d - a, c - b, d - b, d - c
+        volume[n] = (
+            e[0, 0] * (e[1, 1] * e[2, 2] - e[1, 2] * e[2, 1])
+            + e[0, 1] * (e[1, 2] * e[2, 0] - e[1, 0] * e[2, 2])
+            + e[0, 2] * (e[1, 0] * e[2, 1] - e[1, 1] * e[2, 0])
+        ) / 6
+        most = 0.0
+        for j in range(6):
+            most = max(most, e[j, 0] ** 2 + e[j, 1] ** 2 + e[j, 2] ** 2)
+        longest[n] = most**0.5
+    return volume, longest
 
 
 def triangle_areas(X: np.ndarray, cells: np.ndarray) -> np.ndarray:

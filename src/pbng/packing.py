@@ -72,6 +72,7 @@ class Packed:
     def pack(self, x: np.ndarray) -> np.ndarray:
         """Positions (n_vert, 3) as the flat array (4 n_slot,) that kernels read."""
         out = aligned(4 * self.n_slot, self.dtype)
+        out[:] = 0
         out.reshape(-1, 4)[self.slot, :3] = x
         return out
 
@@ -81,10 +82,9 @@ class Packed:
 
 
 def aligned(n: int, dtype) -> np.ndarray:
-    """Zeros (n,) that begin at a cache line."""
+    """An uninitialised array (n,) that begins at a cache line."""
     size = np.dtype(dtype).itemsize
-    raw = np.empty(n * size + 64, np.uint8)  # not np.zeros: NumPy asks for huge pages only when it allocates plainly
-    raw[:] = 0
+    raw = np.empty(n * size + 64, np.uint8)
     shift = -raw.ctypes.data % 64
     return raw[shift : shift + n * size].view(dtype)
 

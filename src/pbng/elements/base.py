@@ -50,12 +50,12 @@ class ElementKind(ABC):
 
     @abstractmethod
     def energy(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, g, out)``: energy [J] of the first m of the W elements at ``idx[i]``; g and out
-        are scratch."""
+        """``(m, i, x, X, idx, par, p, gx, gX, out)``: energy [J] of the first m of the W elements at ``idx[i]``; the last
+        three are scratch."""
 
     @abstractmethod
     def forces(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, g, out, f, o)``: the same, with forces on corners written to ``f[o]``; returns
+        """``(m, i, x, X, idx, par, p, gx, gX, out, f, o)``: the same, with forces on corners written to ``f[o]``; returns
         the energy, the sum of the norms of the elements' forces [N] and the number of inverted elements."""
 
     @abstractmethod
@@ -67,6 +67,13 @@ class ElementKind(ABC):
 def vec(g, j):
     """Vector at position j of a scratch array of 4-component vectors, the fourth zero."""
     return g[j] + g[j + uint64(3)], g[j + uint64(1)], g[j + uint64(2)]
+
+
+@inline
+def wide_vec(g, j):
+    """The same in float64."""
+    a = vec(g, j)
+    return np.float64(a[0]), np.float64(a[1]), np.float64(a[2])
 
 
 @inline

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import uint64
 
-from pbng.elements.base import AHEAD, ElementKind, W, gather, parameters, vec
+from pbng.elements.base import AHEAD, ElementKind, W, gather, parameters, vec, wide_vec
 from pbng.jit import fingerprint, inline
 from pbng.linalg import add, cofactor, combine, combine3, cross, det, dot, mat_vec, scale, sub
 from pbng.materials.base import Model
@@ -94,20 +94,20 @@ class Simplex(ElementKind):
         return 1 / 2 if self.plane else 1 / 6
 
     @cache
-    def _edges(self) -> Any:
+    def _edges(self, load: Any) -> Any:
         """``(g, j, x) -> a, b, e`` from the scratch array at lane position j and the last corner x."""
         if self.plane:
 
             @inline
             def edges(g, j, x):
-                p, one = vec(g, j), type(x[0])(1)
-                return sub(vec(g, _Q + j), p), (one - one, one - one, one), sub(x, p)
+                p, one = load(g, j), type(x[0])(1)
+                return sub(load(g, _Q + j), p), (one - one, one - one, one), sub(x, p)
         else:
 
             @inline
             def edges(g, j, x):
-                p = vec(g, j)
-                return sub(vec(g, _Q + j), p), sub(vec(g, _R + j), p), sub(x, p)
+                p = load(g, j)
+                return sub(load(g, _Q + j), p), sub(load(g, _R + j), p), sub(x, p)
 
         return edges
 
@@ -174,7 +174,7 @@ class Simplex(ElementKind):
     @cache
     def _incidence(self, model: Model) -> Any:
         """``(g, j, x, coef, c, b, m) -> V P g, h, v``: a node's negative force and the term h v vᵀ of its Hessian."""
-        edges, stress = self._edges(), model.stress
+        edges, stress = self._edges(vec), model.stress
         if model.isotropic:
 
             @inline
@@ -200,15 +200,15 @@ class Simplex(ElementKind):
 
     @cache
     def _element(self) -> Any:
-        """``(g, j) -> F, ga, gb, ge, V`` from the scratch array: current positions, then rest positions."""
-        edges, share, last = self._edges(), self.share, _R if self.plane else _S
-        rest = uint64(4 * W * self.corners)
+        """``(gx, gX, j) -> F, ga, gb, ge, V`` in float64 from the current and the rest positions in scratch arrays."""
+        edges, rest_edges, share = self._edges(wide_vec), self._edges(vec), self.share
+        last = _R if self.plane else _S
 
         @inline
-        def element(g, j):
-            A, B, E = edges(g, rest + j, vec(g, rest + last + j))
+        def element(gx, gX, j):
+            A, B, E = rest_edges(gX, j, vec(gX, last + j))
             ga, gb, ge, V = gradients(A, B, E, share)
-            a, b, e = edges(g, j, vec(g, last + j))
+            a, b, e = edges(gx, j, wide_vec(gx, last + j))
             return outer_sum(a, ga, b, gb, e, ge), ga, gb, ge, V
 
         return element
@@ -217,16 +217,15 @@ class Simplex(ElementKind):
     def energy(self, model: Model) -> Any:
         corners, element, psi = self.corners, self._element(), model.energy
         numbers = parameters(model.n_parameters)
-        rest = uint64(4 * W * corners)
 
         @inline
-        def energy(m, i, x, X, idx, par, p, g, out):
+        def energy(m, i, x, X, idx, par, p, gx, gX, out):
             number = numbers(par, p + uint64(1))
-            gather(corners, i, x, idx, g, zero)
-            gather(corners, i, X, idx, g, rest)
+            gather(corners, i, x, idx, gx, zero)
+            gather(corners, i, X, idx, gX, zero)
             for l_ in range(W):
                 l = uint64(l_)
-                F, ga, gb, ge, V = element(g, l * uint64(4))
+                F, ga, gb, ge, V = element(gx, gX, l * uint64(4))
                 out[l] = V * psi(F, *number)
             total = 0.0
             for l_ in range(m):
@@ -239,17 +238,16 @@ class Simplex(ElementKind):
     def forces(self, model: Model) -> Any:
         corners, element, psi, stress, plane = self.corners, self._element(), model.energy, model.stress, self.plane
         numbers = parameters(model.n_parameters)
-        rest = uint64(4 * W * corners)
         last = _6 if plane else _9  # where the force on the last corner goes
 
         @inline
-        def forces(m, i, x, X, idx, par, p, g, out, f, o):
+        def forces(m, i, x, X, idx, par, p, gx, gX, out, f, o):
             number = numbers(par, p + uint64(1))
-            gather(corners, i, x, idx, g, zero)
-            gather(corners, i, X, idx, g, rest)
+            gather(corners, i, x, idx, gx, zero)
+            gather(corners, i, X, idx, gX, zero)
             for l_ in range(W):
                 l = uint64(l_)
-                F, ga, gb, ge, V = element(g, l * uint64(4))
+                F, ga, gb, ge, V = element(gx, gX, l * uint64(4))
                 P = stress(F, *number)
                 fa = scale(-V, mat_vec(P, ga))
                 fb = scale(-V, mat_vec(P, gb))

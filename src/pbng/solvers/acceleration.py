@@ -35,6 +35,9 @@ class Iteration(Protocol):
     def step(self, x: np.ndarray) -> None:
         """One iteration, in place."""
 
+    def settle(self, x: np.ndarray) -> None:
+        """Make x a state to stop at: where energy is safeguarded, one whose energy has not risen."""
+
 
 class Acceleration(Protocol):
     """Description of an acceleration."""
@@ -66,6 +69,9 @@ class _Sweeps:
 
     def step(self, x: np.ndarray) -> None:
         self.map.apply(x, self.omega)
+
+    def settle(self, x: np.ndarray) -> None:
+        pass
 
 
 @dataclass(frozen=True)
@@ -117,13 +123,17 @@ class _TwoStep:
         x[:n] = omega * (gamma * (x[:n] - here) + here - before) + before
         self.before = here
 
+    def settle(self, x: np.ndarray) -> None:
+        pass
+
 
 @dataclass(frozen=True)
 class Anderson:
     """Anderson mixing of the last ``memory`` sweeps, taken only where it lowers the energy; never diverges.
 
     With f_k = G(x_k) - x_k, θ minimises |f_k - ΔF θ| and x_{k+1} = G(x_k) - ΔG θ if that is no higher than x_k, else
-    G(x_k), after which the history starts afresh.
+    G(x_k), after which the history starts afresh. An energy costs most of a sweep, so once mixing has proved itself it
+    is evaluated every few iterations only; if it has risen, the iteration returns to where it was last known.
     """
 
     memory: int = 10
@@ -140,9 +150,13 @@ class Anderson:
 
 
 class _Mixing:
+    PROBATION, EVERY = 5, 5  # mixed steps in a row that must prove good one by one; then one in so many is checked
+
     def __init__(self, map: FixedPoint, memory: int, omega: float) -> None:
         self.map, self.memory, self.omega = map, memory, omega
-        self.energy = math.inf
+        self.energy = math.inf  # at the last checked state
+        self.unchecked = 0  # steps since
+        self.good = 0  # checks passed in a row
         self.rejected = 0
         self.buffers: tuple[np.ndarray, ...] = ()
 
@@ -150,21 +164,45 @@ class _Mixing:
         n = self.map.n_free
         if not self.buffers:
             self._allocate(x, n)
-        g, mixed = self.buffers
+        g, mixed, checked = self.buffers
         g[:] = x
         self.map.apply(g, self.omega)
         if self._push(x[:n], g[:n]):
             mixed[:] = g
             _mix(g[:n], self.dG, self._weights(), mixed[:n])
-            energy = self.map.energy(mixed)
-            if energy <= self.energy:
-                x[:], self.energy = mixed, energy
+            if self.good >= self.PROBATION and self.unchecked + 1 < self.EVERY:
+                x[:] = mixed
+                self.unchecked += 1
                 return
-            self.count, self.rejected = -1, self.rejected + 1
-        x[:], self.energy = g, self.map.energy(g)
+            if self._passes(mixed):
+                x[:] = mixed
+                return
+            if self.unchecked:
+                g[:] = checked
+                self.map.apply(g, self.omega)
+            self._restart()
+        x[:] = checked[:] = g
+        self.energy, self.unchecked = self.map.energy(g), 0
+
+    def settle(self, x: np.ndarray) -> None:
+        if self.unchecked and not self._passes(x):
+            x[:] = self.buffers[2]
+            self._restart()
+
+    def _passes(self, x: np.ndarray) -> bool:
+        """Whether the energy at x has not risen since the last check; if so, x is the last checked state now."""
+        energy = self.map.energy(x)
+        if not energy <= self.energy:
+            return False
+        self.buffers[2][:] = x
+        self.energy, self.unchecked, self.good = energy, 0, self.good + 1
+        return True
+
+    def _restart(self) -> None:
+        self.count, self.good, self.unchecked, self.rejected = -1, 0, 0, self.rejected + 1
 
     def _allocate(self, x: np.ndarray, n: int) -> None:
-        self.buffers = np.empty_like(x), np.empty_like(x)
+        self.buffers = np.empty_like(x), np.empty_like(x), np.empty_like(x)  # G(x), mixed, last checked
         self.dF, self.dG = np.zeros((self.memory, n), x.dtype), np.zeros((self.memory, n), x.dtype)
         self.f, self.g = np.zeros(n, x.dtype), np.zeros(n, x.dtype)
         self.gram, self.rhs = np.zeros((self.memory, self.memory)), np.zeros(self.memory)

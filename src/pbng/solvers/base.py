@@ -171,6 +171,9 @@ class Method(Protocol):
     def step(self) -> None:
         """One iteration."""
 
+    def settle(self) -> None:
+        """Make the present state one to look at or stop at."""
+
     def state(self) -> np.ndarray:
         """The present positions [m], (n_vert, 3)."""
 

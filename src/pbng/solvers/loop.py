@@ -36,6 +36,7 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
                 if before is not None:
                     correction = float(np.abs(method.state() - before).max(initial=0.0))
                 if due:
+                    method.settle()
                     history.add(iteration, method.certify())
                     status = _verdict(history, tolerance, floor)
                     if monitor is not None:
@@ -43,6 +44,7 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
     if history.monitored[-1] != iteration:
+        method.settle()
         history.add(iteration, method.certify())
         if status in (Status.ITERATIONS, Status.SECONDS):
             status = _verdict(history, tolerance, floor) or status

@@ -97,6 +97,11 @@ class PackedMethod:
         with self._threads():
             self.iteration.step(self.x)
 
+    def settle(self) -> None:
+        if self.iteration is not None:
+            with self._threads():
+                self.iteration.settle(self.x)
+
     def state(self) -> np.ndarray:
         return self.packed.unpack(self.x)
 
