@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange, uint64
 
 from pbng.coloring import morton
-from pbng.dispatch import Term, specialised, term_energy, term_forces
+from pbng.dispatch import specialised, term_energy, term_forces
 from pbng.elements.base import W
 from pbng.jit import FLAGS, kernel, serial
 
@@ -38,9 +38,8 @@ class ElementBlocks:
     def __init__(self, groups, X: np.ndarray, slot: np.ndarray | None = None, n_slot: int | None = None) -> None:
         slot = np.arange(len(X)) if slot is None else slot
         self.n_slot = len(X) if n_slot is None else n_slot
-        self.X = np.zeros((self.n_slot, 4))
-        self.X[slot, :3] = X
-        self.X = self.X.ravel()
+        self.X = np.zeros(4 * self.n_slot)
+        self.X.reshape(-1, 4)[slot, :3] = X
         self.terms = tuple(dict.fromkeys(g.term for g in groups))
         self.parameters, first = group_parameters(groups, np.float64)
         rank = np.empty(len(X), np.int64)

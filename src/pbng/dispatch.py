@@ -7,7 +7,7 @@ user's material costs what a built-in of the same arithmetic costs.
 """
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 from numba.extending import overload
@@ -27,7 +27,7 @@ class Term(NamedTuple):
 _TERMS: dict[str, tuple[Term, ...]] = {}
 
 
-@lru_cache(maxsize=None)
+@cache
 def specialised(make: Callable[[str], Any], terms: tuple[Term, ...]) -> Any:
     """The kernel ``make(key)`` for these terms; compiled on first use, then loaded from Numba's cache."""
     parts = [fingerprint(make)]

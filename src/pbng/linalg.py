@@ -144,7 +144,7 @@ def _halley_thrice(s, I1, I2, J):
 def _trace_bound(I1, I2, J):
     """An upper bound on tr S, exact at rest: (s² - I1)² = 4 (I2 + 2 J s) is at most 12 I2, or 4 I2 if J <= 0."""
     real = type(I1)
-    bound = (real(12) if J > real(0) else real(4)) * max(I2, real(0))
+    bound = (real(12) if real(0) < J else real(4)) * max(I2, real(0))
     return math.sqrt(I1 + math.sqrt(bound) + real(1e-12))
 
 
@@ -155,7 +155,7 @@ def _stretch_trace(I1, I2, J):
 @overload(_stretch_trace, jit_options={"forceinline": True, **FLAGS})
 def _(I1, I2, J):
     """tr S to rounding: three steps in float32; in float64 as many with float32's cheap divisions, then two more."""
-    if I1 == types.float32:
+    if types.float32 == I1:
         return lambda I1, I2, J: _halley_thrice(_trace_bound(I1, I2, J), I1, I2, J)
 
     def double(I1, I2, J):

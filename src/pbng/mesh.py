@@ -118,6 +118,11 @@ class Mesh:
         """Triangles (m, 3) int32 of the boundary of a solid, normals outward, or of the mesh itself if it is one."""
         return self.cells
 
+    @cached_property
+    def volume(self) -> np.ndarray:
+        """Rest measure of each cell, (n_elem,): volume [m³] of tets, area [m²] of triangles."""
+        raise TypeError("make a TetMesh or a TriMesh")
+
     def where(
         self,
         which: str | np.ndarray | Callable[[np.ndarray], np.ndarray] | None = None,
@@ -141,7 +146,7 @@ class Mesh:
         eps = 1e-6 * self.size if tol is None else tol
         for axis, wanted in enumerate((x, y, z)):
             if wanted is not None:
-                low, high = (wanted, wanted) if np.isscalar(wanted) else wanted  # type: ignore[misc]
+                low, high = wanted if isinstance(wanted, tuple | list) else (wanted, wanted)
                 chosen &= (self.X[:, axis] >= low - eps) & (self.X[:, axis] <= high + eps)
         return np.flatnonzero(chosen)
 

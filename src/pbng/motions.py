@@ -60,7 +60,7 @@ class Translate(Affine):
 
 @dataclass(frozen=True)
 class Rotate(Affine):
-    """Turn by ``turns`` revolutions about an axis ("x", "y", "z" or a vector) through the centroid or ``center`` [m]."""
+    """Turn by ``turns`` about an axis ("x", "y", "z" or a vector) through the centroid or ``center`` [m]."""
 
     axis: str | Sequence[float]
     turns: float
@@ -131,7 +131,7 @@ class Sum(Motion):
 
 @dataclass(frozen=True, eq=False)
 class Animation(Motion):
-    """A vertex animation: positions [m] (n_time, n, 3) at rising times [s] (n_time,), linear in between, held outside."""
+    """A vertex animation: positions [m] (n_time, n, 3) at rising times [s] (n_time,), linear between, held outside."""
 
     times: np.ndarray
     positions: np.ndarray

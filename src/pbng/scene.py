@@ -89,7 +89,7 @@ class Scene:
             at: Translation [m] of the mesh, (3,).
 
         Raises:
-            InputError: The name is taken, groups are unknown, overlap or leave cells out, or a triangle mesh is not plane.
+            InputError: The name is taken, groups are unknown, overlap or leave cells out, or triangles are not plane.
         """
         name = f"body{len(self.bodies)}" if name is None else name
         if name in (b.name for b in self.bodies):
@@ -142,11 +142,11 @@ class Scene:
         mesh, start = selection.body.mesh, selection.body.start
         chosen = np.zeros(mesh.n_vert, bool)
         chosen[selection.vertices] = True
-        faces = mesh.surface if isinstance(mesh, TetMesh) else mesh.boundary_edges
+        faces = mesh.boundary_edges if isinstance(mesh, TriMesh) else mesh.surface
         faces = faces[chosen[faces].all(1)]
         if len(faces) == 0:
             raise InputError(f"traction on {selection.words}: no whole face of the surface is selected")
-        if isinstance(mesh, TetMesh):
+        if faces.shape[1] == 3:
             measure = np.linalg.norm(triangle_areas(mesh.X, faces), axis=1)
         else:
             measure = np.linalg.norm(mesh.X[faces[:, 1]] - mesh.X[faces[:, 0]], axis=1)

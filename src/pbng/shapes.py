@@ -49,7 +49,7 @@ def _five_tets(n: tuple[int, ...]) -> np.ndarray:
 
 
 def beam(length: float = 4.0, width: float = 1.0, vertices: int = 8) -> TetMesh:
-    """A slender box along x with a square section of ``vertices`` x ``vertices`` and cells as near to cubes as can be."""
+    """A slender box along x [m], ``vertices`` x ``vertices`` in section, its cells as near to cubes as can be."""
     length, width = _sizes("beam", (length, width), 2)
     (m,) = _counts("beam", vertices, 1)
     along = max(2, round(length / width * (m - 1)) + 1)

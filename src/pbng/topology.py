@@ -62,10 +62,10 @@ def _match_faces(cells, faces, n_vert):
     for v in range(n_vert):
         for p in range(start[v], start[v + 1]):
             i = bucket[p]
-            a, b, c = _rotated(cells, faces, i)
+            _, b, c = _rotated(cells, faces, i)
             for q in range(p + 1, start[v + 1]):
                 j = bucket[q]
-                r, s, t = _rotated(cells, faces, j)
+                _, s, t = _rotated(cells, faces, j)
                 if not ((b == s and c == t) or (b == t and c == s)):
                     continue
                 code = 0
@@ -75,7 +75,7 @@ def _match_faces(cells, faces, n_vert):
                     code = 2
                 elif b == s:
                     code = 1
-                if code and (bad[0] == 0 or code == 3 and bad[0] != 3):
+                if code and (bad[0] == 0 or (code == 3 and bad[0] != 3)):
                     bad[0], bad[1], bad[2] = code, i, j
                 partner[i], partner[j] = j, i
     return partner, bad

@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ def measure(
             colors = np.tile(np.arange(len(packed.color_start) - 1), 5)
             for count in threads:
                 numba.set_num_threads(count)
-                contestants: dict[str, Callable[[], Any]] = {"pbng": lambda: sweep(packed, x, colors)}
+                contestants: dict[str, Callable[[], Any]] = {"pbng": partial(sweep, packed, x, colors)}
                 if reference is not None:
                     contestants["reference"] = _reference(reference, problem, model, np.dtype(dtype))
                 seconds = {k: s / 5 for k, s in interleaved(contestants, rounds).items()}
@@ -79,8 +80,8 @@ def _reference(folder: Path, problem: Problem, model: str, dtype: np.dtype) -> C
         raise InputError(f"{folder} holds no pbng_numba.py to compare with")
     if str(folder) not in sys.path:
         sys.path.insert(0, str(folder))
-    import common  # type: ignore[import-not-found]
-    import pbng_numba  # type: ignore[import-not-found]
+    import common
+    import pbng_numba
 
     runs = {"corotated": pbng_numba.run_fc, "neo-hookean": pbng_numba.run_nh}
     if model not in runs:

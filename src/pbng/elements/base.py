@@ -50,13 +50,13 @@ class ElementKind(ABC):
 
     @abstractmethod
     def energy(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, gx, gX, out)``: energy [J] of the first m of the W elements at ``idx[i]``; the last
-        three are scratch."""
+        """``(m, i, x, X, idx, par, p, gx, gX, out)``: energy [J] of the first m of the W elements at
+        ``idx[i]``; the last three arguments are scratch."""
 
     @abstractmethod
     def forces(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, gx, gX, out, f, o)``: the same, with forces on corners written to ``f[o]``; returns
-        the energy, the sum of the norms of the elements' forces [N] and the number of inverted elements."""
+        """``(m, i, x, X, idx, par, p, gx, gX, out, f, o)``: the same, with forces on corners written to ``f[o]``;
+        returns the energy, the sum of the norms of the elements' forces [N] and the number of inverted elements."""
 
     @abstractmethod
     def fingerprint(self, model: Model) -> str:

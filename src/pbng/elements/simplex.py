@@ -225,7 +225,7 @@ class Simplex(ElementKind):
             gather(corners, i, X, idx, gX, zero)
             for l_ in range(W):
                 l = uint64(l_)
-                F, ga, gb, ge, V = element(gx, gX, l * uint64(4))
+                F, _ga, _gb, _ge, V = element(gx, gX, l * uint64(4))
                 out[l] = V * psi(F, *number)
             total = 0.0
             for l_ in range(m):

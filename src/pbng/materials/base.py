@@ -7,7 +7,7 @@ into the same kernels whether they come with pbng or from a user.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from typing import Any, ClassVar, NamedTuple, TypeVar, dataclass_transform
 
 from pbng.errors import InputError
@@ -97,8 +97,8 @@ class Model(NamedTuple):
     fingerprint: str
 
 
-@lru_cache(maxsize=None)
-def model_of(cls: type[Material], n_parameters: int) -> Model:
+@cache
+def model_of(cls: Any, n_parameters: int) -> Model:
     """The model of a material class; compiled when a kernel first needs it."""
     energy, stress = _compiled(cls, "energy"), _compiled(cls, "stress")
     return Model(cls.__name__, energy, stress, n_parameters, cls.isotropic, fingerprint(energy, stress))
@@ -129,4 +129,5 @@ def material(cls: M) -> M:
         if own is not None:
             plain = own.__func__ if isinstance(own, staticmethod) else own
             setattr(cls, name, staticmethod(plain if hasattr(plain, "py_func") else function(plain)))
-    return dataclass(frozen=True, kw_only=True)(cls)
+    made: Any = dataclass(frozen=True, kw_only=True)(cls)
+    return made

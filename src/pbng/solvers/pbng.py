@@ -29,7 +29,7 @@ class PBNG:
         block: "majorizer", for which no node update can raise the energy, or "paper" for Eq. (32).
         dtype: Precision of the sweeps, "float32" or "float64"; residuals and energies are always float64.
         symmetric: Follow each sweep by one in reverse order of the colours (one iteration is then two sweeps).
-        threads: Threads to use; by default all that Numba was given. Use 1 if other work keeps the machine's cores busy.
+        threads: Threads; by default all that Numba was given. Use 1 if other work keeps the machine's cores busy.
         device: Only "cpu".
     """
 
@@ -78,10 +78,9 @@ class PackedMethod:
         forward = np.arange(len(self.packed.color_start) - 1)
         self.colors = np.concatenate([forward, forward[::-1]]) if solver.symmetric else forward
         self.n_free = self.packed.n_free
-        self.f_ext = np.zeros((self.packed.n_slot, 4))
-        self.f_ext[self.packed.slot, :3] = problem.f_ext
+        self.f_ext = np.zeros(4 * self.packed.n_slot)
+        self.f_ext.reshape(-1, 4)[self.packed.slot, :3] = problem.f_ext
         self.loaded = bool(self.f_ext.any())
-        self.f_ext = self.f_ext.ravel()
         self.forces = np.empty(4 * self.packed.n_slot)
         self.x = self.packed.pack(problem.X)
         self.iteration: Iteration | None = None
