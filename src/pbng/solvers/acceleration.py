@@ -168,15 +168,17 @@ class _Mixing:
         g[:] = x
         self.map.apply(g, self.omega)
         if self._push(x[:n], g[:n]):
-            mixed[:] = g
-            _mix(g[:n], self.dG, self._weights(), mixed[:n])
-            if self.good >= self.PROBATION and self.unchecked + 1 < self.EVERY:
-                x[:] = mixed
-                self.unchecked += 1
-                return
-            if self._passes(mixed):
-                x[:] = mixed
-                return
+            theta = self._weights()
+            if theta is not None:
+                mixed[:] = g
+                _mix(g[:n], self.dG, theta, mixed[:n])
+                if self.good >= self.PROBATION and self.unchecked + 1 < self.EVERY:
+                    x[:] = mixed
+                    self.unchecked += 1
+                    return
+                if self._passes(mixed):
+                    x[:] = mixed
+                    return
             if self.unchecked:
                 g[:] = checked
                 self.map.apply(g, self.omega)
@@ -221,10 +223,14 @@ class _Mixing:
         self.rhs[:kept] = sums[kept : 2 * kept]
         return True
 
-    def _weights(self) -> np.ndarray:
-        """θ of the least-squares problem, from its scaled normal equations with a tiny ridge."""
+    def _weights(self) -> np.ndarray | None:
+        """θ of the least-squares problem, from its scaled normal equations with a tiny ridge; None if it has none."""
         n = min(self.count, self.memory)
-        scale = 1 / np.sqrt(np.maximum(np.diag(self.gram)[:n], 1e-300))
+        norms = np.sqrt(np.diag(self.gram)[:n])
+        used = norms > 1e-12 * norms.max()  # a difference lost in rounding has no direction
+        if not (np.isfinite(self.gram[:n, :n]).all() and np.isfinite(self.rhs[:n]).all() and used.any()):
+            return None
+        scale = np.where(used, 1 / np.where(used, norms, 1.0), 0.0)
         A = self.gram[:n, :n] * scale[:, None] * scale + 1e-12 * n * np.eye(n)
         return scale * np.linalg.lstsq(A, scale * self.rhs[:n], rcond=1e-12)[0]
 

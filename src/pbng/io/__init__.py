@@ -1,0 +1,1 @@
+"""Meshes in; frames and the formats of other programs out."""

@@ -1,0 +1,252 @@
+"""Pictures, films and contact strips of runs, in the manner of the figures of a paper."""
+
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbng.errors import InputError
+from pbng.io.frames import Run
+from pbng.view.camera import Extent, facing, framed, projected_aspect
+from pbng.view.colors import Paint, stretch_map
+from pbng.view.plots import caption, color_bar, over, plot_residuals
+from pbng.view.stage import Floor, Stage
+from pbng.view.surface import Motion, Surface
+from pbng.view.video import Video
+
+MARGIN = 0.07
+BAR = 118  # width [pixels at a height of 720] that a colour bar needs
+
+
+def picture(
+    source: Any,
+    path: str | os.PathLike[str],
+    *,
+    frame: int = -1,
+    color: str = "stretch",
+    size: tuple[int, int] = (1280, 720),
+    edges: bool | None = None,
+    azimuth: float = 28.0,
+    elevation: float = 20.0,
+) -> Path:
+    """Draw one frame as a picture; returns its path.
+
+    Args:
+        source: A run or its folder, a frame or a sequence of frames, a mesh or a sequence of meshes at rest, or a pair
+            of a mesh or a problem and positions (n_vert, 3) [m].
+        path: The .png (or .jpg).
+        frame: Which frame.
+        color: "stretch" (largest principal stretch, with a colour bar), "body" (a colour a body), or a colour by name.
+        size: Width and height [pixels].
+        edges: Whether to draw the edges of the triangles; by default only of plane meshes.
+        azimuth: Where the camera stands: angle [degrees] from the z axis towards x.
+        elevation: Angle [degrees] at which it looks down.
+
+    Raises:
+        InputError: There is nothing to draw, the frame or the colour is unknown, or the file cannot be written.
+    """
+    motion = Motion.of(source)
+    if not -len(motion) <= frame < len(motion):
+        raise InputError(f"no frame {frame} in a run of {len(motion)}")
+    path = _ready(path)
+    artist = _Artist(motion, color, edges, azimuth, elevation)
+    with artist.stage(size) as stage:
+        return _save(artist.draw(stage, motion.frames[frame]), path)
+
+
+def film(
+    source: Any,
+    path: str | os.PathLike[str],
+    *,
+    fps: float | None = None,
+    color: str = "stretch",
+    size: tuple[int, int] = (1280, 720),
+    edges: bool | None = None,
+    azimuth: float = 28.0,
+    elevation: float = 20.0,
+) -> Path:
+    """Draw all frames as an .mp4 (H.264); returns its path.
+
+    The arguments are those of :func:`picture`; ``fps`` is by default the run's own, and an odd width or height is made
+    even. Progress is shown if stderr is a terminal.
+    """
+    motion = Motion.of(source)
+    size = size[0] + size[0] % 2, size[1] + size[1] % 2
+    path = _ready(path)
+    artist = _Artist(motion, color, edges, azimuth, elevation)
+    with artist.stage(size, sampling=2) as stage, Video(path, size, motion.fps if fps is None else fps) as video:
+        for k in _shown(range(len(motion)), path.name):
+            video.write(artist.draw(stage, motion.frames[k]))
+    return path
+
+
+def sheet(
+    source: Any,
+    path: str | os.PathLike[str],
+    frames: int = 6,
+    *,
+    color: str = "stretch",
+    width: int = 1800,
+    edges: bool | None = None,
+    azimuth: float = 28.0,
+    elevation: float = 20.0,
+) -> Path:
+    """Draw several frames, evenly spaced in time, side by side in one picture; returns its path.
+
+    The arguments are those of :func:`picture`; ``width`` [pixels] is that of the whole, its height follows.
+    """
+    motion = Motion.of(source)
+    chosen = np.unique(np.linspace(0, len(motion) - 1, max(1, min(frames, len(motion)))).round().astype(int))
+    path = _ready(path)
+    artist = _Artist(motion, color, edges, azimuth, elevation)
+    unit = width / 1600
+    room = round(BAR * unit) if artist.paint.bar else 0
+    columns, tile = _tiles(len(chosen), artist.aspect(), width - room)
+    page = np.full((-(-len(chosen) // columns) * tile[1], columns * tile[0] + room, 3), 255, np.uint8)
+    with artist.stage(tile, tile=True) as stage:
+        for i, k in enumerate(chosen):
+            frame = motion.frames[k]
+            row, column = i // columns * tile[1], i % columns * tile[0]
+            image = over(_faded(artist.draw(stage, frame, bar=False)), caption(tile, f"t = {frame.t:.2f} s", unit))
+            page[row : row + tile[1], column : column + tile[0]] = image
+    return _save(artist.with_bar(page, unit), path)
+
+
+def view(source: Any, out: str | os.PathLike[str] | None = None) -> list[Path]:
+    """Look at a run: its last frame, a strip, a film and its residuals; returns the files written.
+
+    Args:
+        source: A run or its folder.
+        out: The folder for the pictures; by default next to the run, its name with "_view" added.
+    """
+    run = source if isinstance(source, Run) else Run(source)
+    folder = run.path.parent / f"{run.path.stem}_view" if out is None else Path(out)
+    written = [picture(run, folder / "last.png")]
+    if len(run) > 1:
+        written += [sheet(run, folder / "strip.png"), film(run, folder / "film.mp4")]
+    series, xlabel = _residuals(run)
+    return [*written, plot_residuals(series, folder / "residuals.png", xlabel, "residual [N]", run.name)]
+
+
+class _Artist:
+    """What is the same in all pictures of a motion: its surface, colours, and what it sweeps."""
+
+    def __init__(self, motion: Motion, color: str, edges: bool | None, azimuth: float, elevation: float) -> None:
+        self.plane = motion.is_plane()
+        self.edges = self.plane if edges is None else edges
+        self.angles = azimuth, elevation
+        self.surface = Surface(motion)
+        self.extent = Extent.of(motion, self.surface)
+        self.reach = 0.4 * float(np.median([np.linalg.norm(np.ptp(body.mesh.X, axis=0)) for body in motion.bodies]))
+        self.paint = Paint(self.surface, motion, color)
+        self._bar: np.ndarray | None = None
+
+    def stage(self, size: tuple[int, int], *, tile: bool = False, sampling: int = 3) -> Stage:
+        """A stage of the size [pixels], with room for the colour bar; a tile has neither that nor a tinted floor."""
+        if min(size) < 16:
+            raise InputError(f"a picture of {size[0]} x {size[1]} pixels is too small")
+        aspect = size[0] / size[1]
+        room = BAR * size[1] / 720 / size[0] if self.paint.bar and not tile else 0.0
+        margins = (MARGIN, max(MARGIN, room), 1.6 * MARGIN, 0.8 * MARGIN)  # below there is shadow
+        if self.plane:
+            camera, floor, reach = facing(self.extent, aspect, margins), None, 0.0
+        else:
+            azimuth, elevation = self.angles
+            camera = framed(self.extent, aspect, azimuth=azimuth, elevation=elevation, margins=margins)
+            floor, reach = self._floor(tile), self.reach
+        return Stage(self.surface, camera, size, floor=floor, reach=reach, edges=self.edges, sampling=sampling)
+
+    def aspect(self) -> float:
+        """Width over height of what the motion covers in a picture."""
+        if self.plane:
+            width, height, _ = self.extent.high - self.extent.low
+            return float(width / max(height, 1e-9 * self.extent.size))
+        return projected_aspect(self.extent, *self.angles)
+
+    def draw(self, stage: Stage, frame: Any, bar: bool = True) -> np.ndarray:
+        """The image (height, width, 3) uint8 of a frame."""
+        image = stage(frame.x, self.paint(frame.x))
+        return self.with_bar(image, image.shape[0] / 720) if bar else image
+
+    def with_bar(self, image: np.ndarray, unit: float) -> np.ndarray:
+        if self.paint.bar is None:
+            return image
+        if self._bar is None or self._bar.shape[:2] != image.shape[:2]:
+            size = image.shape[1], image.shape[0]
+            self._bar = color_bar(size, *self.paint.bar, stretch_map(), "largest principal stretch", unit)
+        return over(image, self._bar)
+
+    def _floor(self, tile: bool) -> Floor:
+        low, high = self.extent.low, self.extent.high
+        centre = (low + high) / 2
+        centre[1] = low[1] - 2e-3 * self.extent.size  # below what lies on it, or the two would mix
+        reach = np.hypot(*(high - low)[[0, 2]]) / 2
+        floor = Floor(centre, 1.6 * reach + 1.1 * (high - low)[1], float(high[1] - centre[1]))
+        return replace(floor, tint=0.0) if tile else floor
+
+
+def _tiles(n: int, aspect: float, width: int) -> tuple[int, tuple[int, int]]:
+    """How many columns of tiles of which size fill a page of the width best: one about twice as wide as high."""
+    aspect = float(np.clip(aspect, 0.4, 4.0))
+
+    def waste(columns: int) -> float:
+        rows = -(-n // columns)
+        return abs(np.log(columns * aspect / rows / 2.2)) + 0.5 * (rows * columns - n)
+
+    columns = min(range(1, n + 1), key=waste)
+    across = width // columns
+    return columns, (across, round(across / aspect * 1.12))
+
+
+def _faded(image: np.ndarray) -> np.ndarray:
+    """The image turning white towards its edges, within the margins, so that no seam shows between tiles."""
+    ramps = [np.clip((np.minimum(k := np.arange(n), n - 1 - k)) / (1.3 * MARGIN * n), 0, 1) for n in image.shape[:2]]
+    rows, columns = (ramp * ramp * (3 - 2 * ramp) for ramp in ramps)
+    return np.rint(255 - (255 - image) * (rows[:, None] * columns)[..., None]).astype(np.uint8)
+
+
+def _residuals(run: Run) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], str]:
+    """Curves of the residuals: over the iterations of the one frame, or before and after those of each frame."""
+    if len(run) == 1:
+        frame = run[0]
+        return {frame.status.lower(): (frame.monitored, frame.residuals)}, "iteration"
+    t, first, last = np.array([(frame.t, frame.residuals[0], frame.residuals[-1]) for frame in run]).T
+    return {"start of frame": (t, first), "end of frame": (t, last)}, "time [s]"
+
+
+def _shown(items: range, what: str) -> Iterable[int]:
+    """The items, with a progress bar if anyone is looking."""
+    if not sys.stderr.isatty():
+        return items
+    return _with_progress(items, what)
+
+
+def _with_progress(items: range, what: str) -> Iterator[int]:
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(items, what, console=Console(stderr=True), transient=True)
+
+
+def _ready(path: str | os.PathLike[str]) -> Path:
+    """The path, in a folder that exists: found out before the work, not after."""
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+    return path
+
+
+def _save(image: np.ndarray, path: Path) -> Path:
+    from PIL import Image
+
+    try:
+        Image.fromarray(image).save(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot write {path}: {error}") from error
+    return path

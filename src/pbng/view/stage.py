@@ -1,0 +1,131 @@
+"""A stage for pictures: light, floor and camera, set once; then one image a frame."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from pbng.view.camera import VIEW_ANGLE, Camera
+from pbng.view.light import Light
+from pbng.view.occlusion import occlude
+from pbng.view.shadow import PIXELS, Shadow
+from pbng.view.surface import Surface
+from pbng.view.window import INK, Window
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """A square: its centre (x, y, z) [m], half its side [m], the greatest height [m] of anything above it, and how dark
+    it is where no shadow falls.
+    """
+
+    centre: np.ndarray
+    half: float
+    top: float
+    tint: float = 0.055
+
+
+class Stage:
+    """An image (height, width, 3) uint8 of a surface for each call; close it, or use it in ``with``.
+
+    Args:
+        surface: What to draw.
+        camera: From where.
+        size: Width and height [pixels].
+        floor: What shadows fall on, if anything.
+        reach: How far [m] surfaces take light from each other; 0 for no such shading.
+        edges: Whether to draw the edges of the triangles.
+        sampling: Each pixel is the mean of so many by so many.
+
+    Raises:
+        InputError: pyvista is not installed, or the machine has nothing to draw with.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        camera: Camera,
+        size: tuple[int, int],
+        *,
+        floor: Floor | None,
+        reach: float,
+        edges: bool,
+        sampling: int,
+    ) -> None:
+        self.surface, self.sampling, self.reach = surface, sampling, reach
+        n, triangles = len(surface.source), surface.triangles
+        back = camera.position - camera.focus
+        back = back / np.linalg.norm(back)
+        self.frame = np.stack([np.cross(camera.up, back), camera.up, back])
+        # A plane seen face on has no shape to model by light.
+        self.light = Light(self.frame) if camera.parallel is None else None
+        large = sampling * size[0], sampling * size[1]
+        self.window = Window(n, triangles, camera, large, 0.8 * sampling if edges else 0.0)
+        # Light from around has no fine detail: it is found in an image of half the size, which shows the normals.
+        self.guide = Window(n, triangles, camera, ((size[0] + 1) // 2, (size[1] + 1) // 2)) if reach > 0 else None
+        self.shadow = None if floor is None else self._lay(floor)
+
+    def __call__(self, x: np.ndarray, color: np.ndarray) -> np.ndarray:
+        """The image of the surface when the bodies are at x (n_vert, 3), its points having the colours (n, 3) uint8."""
+        points = self.surface.points(x)
+        normals = self.surface.normals(points)
+        if self.shadow is not None:
+            self.shadow(points, self.surface.triangles)
+        if self.light is None:
+            self.window.draw(points, color, color)
+        else:
+            lit = (np.minimum(color * self.light(side), 255).astype(np.uint8) for side in (normals, -normals))
+            self.window.draw(points, *lit)
+        image = _shrunk(self.window.image(), self.sampling)
+        if self.guide is not None:
+            seen = normals @ self.frame.T
+            self.guide.draw(points, *(np.rint(127.5 * (side + 1)).astype(np.uint8) for side in (seen, -seen)))
+            tangent = np.tan(np.radians(VIEW_ANGLE) / 2)
+            step = self.surface.edge
+            depth = self.window.depth(self.sampling)
+            occlude(image, depth, self.guide.depth(), self.guide.image(), tangent, self.reach, step)
+        return image
+
+    def close(self) -> None:
+        self.window.close()
+        if self.guide is not None:
+            self.guide.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _lay(self, floor: Floor) -> Callable[[np.ndarray, np.ndarray], None]:
+        """A floor that is all shadow: of one colour, as opaque as it is dark, gone towards its rim."""
+        pv = self.window.pv
+        cast = Shadow(floor.centre, floor.half, floor.top)
+        corners = floor.centre + floor.half * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
+        quad = pv.PolyData.from_regular_faces(corners, [[0, 3, 2, 1]])
+        quad.active_texture_coordinates = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+        image = pv.ImageData(dimensions=(PIXELS, PIXELS, 1))
+        image.point_data["color"] = np.tile(np.array([*INK, 0], np.uint8), (PIXELS**2, 1))
+        texture = pv.Texture(image)
+        texture.InterpolateOn()
+        self.window.plotter.add_mesh(quad, texture=texture, lighting=False, render=False, reset_camera=False)
+        axis = (np.arange(PIXELS) + 0.5) / PIXELS * 2 - 1
+        radius = np.hypot(axis[:, None], axis)
+        fade = np.clip((1 - radius) / 0.75, 0, 1)
+        fade = fade * fade * (3 - 2 * fade)
+        noise = np.random.default_rng(0).random(fade.shape)  # or so few levels would show as rings
+
+        def update(points: np.ndarray, triangles: np.ndarray) -> None:
+            dark = 1 - (1 - floor.tint) * (1 - cast(points, triangles))
+            image.point_data["color"][:, 3] = np.floor(255 * dark * fade + noise).ravel()
+            image.Modified()
+
+        return update
+
+
+def _shrunk(image: np.ndarray, k: int) -> np.ndarray:
+    """Means (h, w, 3) uint8 of squares of k by k pixels."""
+    rows = sum((image[i::k] for i in range(1, k)), image[::k].astype(np.uint16))
+    total = sum((rows[:, j::k] for j in range(1, k)), rows[:, ::k])
+    return ((total + k * k // 2) // (k * k)).astype(np.uint8)
