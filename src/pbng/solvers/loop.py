@@ -14,10 +14,16 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
 
     The clock leaves out compilation. Ctrl-C ends the loop with the last state computed.
     """
-    clock = _Clock()
+    clock, monitoring = _Clock(), _Clock(running=False)
     method.start(x)
     history = History()
-    history.add(0, method.certify())
+
+    def certify(iteration: int) -> None:
+        with monitoring:
+            method.settle()
+            history.add(iteration, method.certify())
+
+    certify(0)
     first, floor = history.last.residual, method.floor()
     tolerance = budget.tolerance(first)
     status = _verdict(history, tolerance, floor)
@@ -36,16 +42,14 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
                 if before is not None:
                     correction = float(np.abs(method.state() - before).max(initial=0.0))
                 if due:
-                    method.settle()
-                    history.add(iteration, method.certify())
+                    certify(iteration)
                     status = _verdict(history, tolerance, floor)
                     if monitor is not None:
                         monitor(_progress(history, tolerance, clock.seconds()))
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
     if history.monitored[-1] != iteration:
-        method.settle()
-        history.add(iteration, method.certify())
+        certify(iteration)
         if status in (Status.ITERATIONS, Status.SECONDS):
             status = _verdict(history, tolerance, floor) or status
     return Result(
@@ -59,6 +63,7 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
         inverted=history.last.inverted,
         correction=correction,
         seconds=clock.seconds(),
+        monitor_seconds=monitoring.seconds(),
     )
 
 
@@ -83,10 +88,21 @@ def _progress(history: History, tolerance: float, seconds: float) -> Progress:
 
 
 class _Clock:
-    """Seconds since it was made, less those spent compiling."""
+    """Seconds while it runs, less those spent compiling; a stopped one runs inside ``with``."""
 
-    def __init__(self) -> None:
-        self.start, self.compiled = time.perf_counter(), compile_seconds()
+    def __init__(self, running: bool = True) -> None:
+        self.total = 0.0
+        self.since = self._now() if running else None
 
     def seconds(self) -> float:
-        return time.perf_counter() - self.start - (compile_seconds() - self.compiled)
+        return self.total + (0.0 if self.since is None else self._now() - self.since)
+
+    def __enter__(self) -> None:
+        self.since = self._now()
+
+    def __exit__(self, *_: object) -> None:
+        self.total, self.since = self.seconds(), None
+
+    @staticmethod
+    def _now() -> float:
+        return time.perf_counter() - compile_seconds()

@@ -1,0 +1,25 @@
+"""The public names: what type checkers read, and what ``__init__.py`` loads lazily."""
+
+from . import gallery as gallery, linalg as linalg, shapes as shapes, view as view
+from .errors import InputError as InputError
+from .io.export import export as export
+from .io.frames import FrameWriter as FrameWriter, read_run as read_run
+from .io.meshes import read_mesh as read_mesh, read_surface as read_surface
+from .materials.base import Block as Block, Material as Material, material as material
+from .materials.check import check_material as check_material
+from .materials.corotated import Corotated as Corotated
+from .materials.linear import LinearElastic as LinearElastic
+from .materials.neo_hookean import NeoHookean as NeoHookean
+from .materials.stable_neo_hookean import StableNeoHookean as StableNeoHookean
+from .mesh import Embedding as Embedding, TetMesh as TetMesh, TriMesh as TriMesh
+from .meshing import creature as creature, tetrahedralize as tetrahedralize
+from .motions import Animation as Animation, Motion as Motion, Rotate as Rotate, Scale as Scale, Translate as Translate
+from .problem import Problem as Problem
+from .quality import quality as quality
+from .scene import Body as Body, Scene as Scene, Selection as Selection
+from .simulate import Frame as Frame, simulate as simulate, solve as solve
+from .solvers.acceleration import SOR as SOR, Anderson as Anderson, Chebyshev as Chebyshev, NodeSOR as NodeSOR
+from .solvers.base import Budget as Budget, Progress as Progress, Result as Result, Status as Status
+from .solvers.pbng import PBNG as PBNG
+
+__version__: str
