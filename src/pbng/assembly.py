@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange, uint64
 
 from pbng.coloring import morton
-from pbng.dispatch import specialised, term_energy, term_forces
+from pbng.dispatch import call, specialised
 from pbng.elements.base import W
 from pbng.jit import FLAGS, kernel, serial
 
@@ -65,18 +65,21 @@ class ElementBlocks:
 
     def energy(self, x: np.ndarray) -> float:
         """Elastic energy [J] at x, flat (4 n_slot,) with a zero fourth component, of either precision."""
-        parts = specialised(make_energy, self.terms)(x, self.X, self.blocks, self.idx, self.parameters)
-        return float(parts.sum())
+        return float(self._run(x, np.empty(0), 0)[0])
 
     def forces(self, x: np.ndarray, f: np.ndarray) -> Evaluation:
         """Write the internal force of every node [N] to f (4 n_slot,) float64; x as for :meth:`energy`."""
         if self._forces is None:
             self._forces = np.empty(3 * len(self.idx))
             self._start, self._place = _places(self.blocks, self.idx, self.n_slot)
-        parts = specialised(make_forces, self.terms)(x, self.X, self.blocks, self.idx, self.parameters, self._forces)
-        found = parts.sum(0)
+        energy, force_scale, inverted = self._run(x, self._forces, len(self.terms))
         _gather(self._start, self._place, self._forces, f)
-        return Evaluation(float(found[0]), float(found[1]), int(found[2]))
+        return Evaluation(float(energy), float(force_scale), int(inverted))
+
+    def _run(self, x: np.ndarray, f: np.ndarray, shift: int) -> np.ndarray:
+        functions = [t.kind.energy(t.model) for t in self.terms] + [t.kind.forces(t.model) for t in self.terms]
+        run = specialised(make_evaluate, tuple(functions))
+        return run(x, self.X, self.blocks, self.idx, self.parameters, shift, f).sum(0)
 
 
 def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -89,47 +92,29 @@ def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarr
     return np.array([v for r in rows for v in r], dtype), first
 
 
-def make_energy(key: str):
-    """Kernel of :meth:`ElementBlocks.energy`: the energy of each chunk."""
+def make_evaluate(key: str):
+    """Kernel of :class:`ElementBlocks`: energy, force scale and inverted elements of each chunk.
+
+    ``shift`` is 0 for the energy alone, or the number of terms for the forces as well.
+    """
 
     @njit(parallel=True, cache=True, **FLAGS)
-    def energy(x, X, blocks, idx, par):
-        n = blocks.shape[0]
-        part = np.zeros((n + CHUNK - 1) // CHUNK)
-        for chunk in prange(part.size):
-            gx, gX = np.empty(16 * W, x.dtype), np.empty(16 * W)
-            out = np.empty(W)
-            total = 0.0
-            for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-                k, p, i, m = blocks[b]
-                total += term_energy(key, k, (m, uint64(i), x, X, idx, par, uint64(p), gx, gX, out))
-            part[chunk] = total
-        return part
-
-    return energy
-
-
-def make_forces(key: str):
-    """Kernel of :meth:`ElementBlocks.forces`: its sums for each chunk."""
-
-    @njit(parallel=True, cache=True, **FLAGS)
-    def forces(x, X, blocks, idx, par, f):
+    def evaluate(x, X, blocks, idx, par, shift, f):
         n = blocks.shape[0]
         part = np.zeros(((n + CHUNK - 1) // CHUNK, 3))
         for chunk in prange(part.shape[0]):
             gx, gX = np.empty(16 * W, x.dtype), np.empty(16 * W)
             out = np.empty(15 * W)
             for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-                k, p, i, m = blocks[b]
-                e, s, inverted = term_forces(
-                    key, k, (m, uint64(i), x, X, idx, par, uint64(p), gx, gX, out, f, uint64(3) * uint64(i))
-                )
+                k, p, first, m = blocks[b]
+                i = uint64(first)
+                e, s, inverted = call(key, k + shift, (m, i, x, X, idx, par, uint64(p), gx, gX, out, f, uint64(3) * i))
                 part[chunk, 0] += e
                 part[chunk, 1] += s
                 part[chunk, 2] += inverted
         return part
 
-    return forces
+    return evaluate
 
 
 @serial

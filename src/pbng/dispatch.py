@@ -1,9 +1,9 @@
 """How a kernel calls the functions of whatever elements and materials a problem holds.
 
-A *term* is an element kind together with a material model. A kernel is made for a tuple of terms, which it knows by a
-string, its key (see :mod:`pbng.jit`); where it calls ``term_sweep(key, k, ...)``, Numba's overload resolution replaces
-the call by one branch a term, and everything is inlined. One kernel thus serves a mesh of several materials, and a
-user's material costs what a built-in of the same arithmetic costs.
+A *term* is an element kind together with a material model. A kernel is made for a tuple of functions, one a term, which
+it knows by a string, their key (see :mod:`pbng.jit`); where it says ``call(key, k, arguments)``, Numba's overload
+resolution puts one branch a function in place, and everything is inlined. One kernel thus serves a mesh of several
+materials, and a user's material costs what a built-in of the same arithmetic costs.
 """
 
 from collections.abc import Callable
@@ -16,6 +16,8 @@ from pbng.elements.base import ElementKind
 from pbng.jit import FLAGS, fingerprint, inline
 from pbng.materials.base import Model
 
+_FUNCTIONS: dict[str, tuple[Any, ...]] = {}
+
 
 class Term(NamedTuple):
     """An element kind with a material model."""
@@ -24,71 +26,43 @@ class Term(NamedTuple):
     model: Model
 
 
-_TERMS: dict[str, tuple[Term, ...]] = {}
-
-
 @cache
-def specialised(make: Callable[[str], Any], terms: tuple[Term, ...]) -> Any:
-    """The kernel ``make(key)`` for these terms; compiled on first use, then loaded from Numba's cache."""
-    parts = [fingerprint(make)]
-    for kind, model in terms:
-        parts.append(f"{kind.name}:{model.name}:{model.fingerprint}:{kind.fingerprint(model)}")
-    key = "|".join(parts)
-    _TERMS[key] = terms
+def specialised(make: Callable[[str], Any], functions: tuple[Any, ...]) -> Any:
+    """The kernel ``make(key)`` that calls these functions; compiled on first use, then loaded from Numba's cache."""
+    key = "-".join(fingerprint(f) for f in (make, *functions))
+    _FUNCTIONS[key] = functions
     return make(key)
 
 
-def _chain(functions: list[Any]) -> Any:
-    """``call(k, arguments)`` that runs the k-th function: an if-chain, built from its end."""
-    call = None
-    for k, function in reversed(list(enumerate(functions))):
-        call = _link(k, function, call)
-    return call
+def call(key, k, arguments):
+    """The k-th function of the kernel's key, called with a tuple of arguments."""
+    raise TypeError("called from compiled code only")
+
+
+@overload(call, prefer_literal=True, jit_options={"forceinline": True, **FLAGS})
+def _(key, k, arguments):
+    functions = _FUNCTIONS[key.literal_value]
+    if len(functions) == 1:
+        (only,) = functions
+        return lambda key, k, arguments: only(*arguments)
+    chosen = _chain(functions)
+    return lambda key, k, arguments: chosen(k, arguments)
+
+
+def _chain(functions: tuple[Any, ...]) -> Any:
+    """``(k, arguments)`` that runs the k-th function: an if-chain, built from its end."""
+    last = functions[-1]
+    chosen = inline(lambda i, arguments: last(*arguments))
+    for k, function in reversed(list(enumerate(functions[:-1]))):
+        chosen = _link(k, function, chosen)
+    return chosen
 
 
 def _link(k: int, function: Any, otherwise: Any) -> Any:
-    if otherwise is None:
-        return inline(lambda i, arguments: function(*arguments))
-
     @inline
-    def call(i, arguments):
+    def chosen(i, arguments):
         if i == k:
             return function(*arguments)
         return otherwise(i, arguments)
 
-    return call
-
-
-def term_pack(key, k, arguments):
-    """Write one incidence into the packed layout; see ``ElementKind.pack``."""
-    raise TypeError("called from compiled code only")
-
-
-def term_sweep(key, k, arguments):
-    """Add rows of incidences to a block's forces and Hessians; see ``ElementKind.sweep``."""
-    raise TypeError("called from compiled code only")
-
-
-def term_energy(key, k, arguments):
-    """Energy of a block of elements; see ``ElementKind.energy``."""
-    raise TypeError("called from compiled code only")
-
-
-def term_forces(key, k, arguments):
-    """Energy and corner forces of a block of elements; see ``ElementKind.forces``."""
-    raise TypeError("called from compiled code only")
-
-
-def _overload(stub: Any, name: str) -> None:
-    @overload(stub, prefer_literal=True, jit_options={"forceinline": True, **FLAGS})
-    def resolve(key, k, arguments):
-        functions = [getattr(kind, name)(model) for kind, model in _TERMS[key.literal_value]]
-        if len(functions) == 1:
-            (only,) = functions
-            return lambda key, k, arguments: only(*arguments)
-        call = _chain(functions)
-        return lambda key, k, arguments: call(k, arguments)
-
-
-for _stub, _name in ((term_pack, "pack"), (term_sweep, "sweep"), (term_energy, "energy"), (term_forces, "forces")):
-    _overload(_stub, _name)
+    return chosen

@@ -27,7 +27,9 @@ FLAGS: dict[str, Any] = {
 
 # A helper that vanishes into the kernel that calls it; Python cannot call it, which makes it compile faster by a fifth.
 inline = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **FLAGS)
-function = njit(forceinline=True, **FLAGS)  # the same, for Python to call too
+# The same, cached: only for helpers that call none from other files, whose changes Numba's cache would not notice.
+leaf = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, cache=True, **FLAGS)
+function = njit(forceinline=True, **FLAGS)  # an inlined helper that Python can call too
 kernel = njit(parallel=True, cache=True, **FLAGS)  # a module-level parallel loop, cached on disk
 serial = njit(cache=True, error_model="numpy")  # a module-level serial loop, cached on disk
 

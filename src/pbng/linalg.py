@@ -11,31 +11,31 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from pbng.jit import FLAGS, inline
+from pbng.jit import FLAGS, leaf
 
 
-@inline
+@leaf
 def add(a, b):
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@inline
+@leaf
 def sub(a, b):
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@inline
+@leaf
 def scale(s, a):
     return s * a[0], s * a[1], s * a[2]
 
 
-@inline
+@leaf
 def combine(s, a, t, b):
     """s a + t b."""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
 
-@inline
+@leaf
 def combine3(s, a, t, b, u, c):
     """s a + t b + u c."""
     return (
@@ -45,17 +45,17 @@ def combine3(s, a, t, b, u, c):
     )
 
 
-@inline
+@leaf
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inline
+@leaf
 def cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@inline
+@leaf
 def identity(like):
     """The unit matrix in the type of the scalar ``like``."""
     one = type(like)(1)
@@ -63,66 +63,66 @@ def identity(like):
     return (one, zero, zero), (zero, one, zero), (zero, zero, one)
 
 
-@inline
+@leaf
 def mat_add(A, B):
     return add(A[0], B[0]), add(A[1], B[1]), add(A[2], B[2])
 
 
-@inline
+@leaf
 def mat_sub(A, B):
     return sub(A[0], B[0]), sub(A[1], B[1]), sub(A[2], B[2])
 
 
-@inline
+@leaf
 def mat_scale(s, A):
     return scale(s, A[0]), scale(s, A[1]), scale(s, A[2])
 
 
-@inline
+@leaf
 def mat_combine(s, A, t, B):
     """s A + t B."""
     return combine(s, A[0], t, B[0]), combine(s, A[1], t, B[1]), combine(s, A[2], t, B[2])
 
 
-@inline
+@leaf
 def mat_vec(A, v):
     return combine3(v[0], A[0], v[1], A[1], v[2], A[2])
 
 
-@inline
+@leaf
 def mat_mul(A, B):
     return mat_vec(A, B[0]), mat_vec(A, B[1]), mat_vec(A, B[2])
 
 
-@inline
+@leaf
 def transpose(A):
     return (A[0][0], A[1][0], A[2][0]), (A[0][1], A[1][1], A[2][1]), (A[0][2], A[1][2], A[2][2])
 
 
-@inline
+@leaf
 def trace(A):
     return A[0][0] + A[1][1] + A[2][2]
 
 
-@inline
+@leaf
 def norm2(A):
     """Squared Frobenius norm |A|²."""
     return dot(A[0], A[0]) + dot(A[1], A[1]) + dot(A[2], A[2])
 
 
-@inline
+@leaf
 def cofactor(F):
     """H = cof F = ∂J/∂F, from products of entries: defined for singular and inverted F."""
     return cross(F[1], F[2]), cross(F[2], F[0]), cross(F[0], F[1])
 
 
-@inline
+@leaf
 def det(F):
     """J = det F."""
     return dot(F[2], cross(F[0], F[1]))
 
 
-@inline
+@leaf
 def _halley(s, I1, I2, J):
     """One Halley step for the largest root of s⁴ - 2 I1 s² - 8 J s + I1² - 4 I2; from above it stays above."""
     real = type(s)
@@ -134,13 +134,13 @@ def _halley(s, I1, I2, J):
     return s - value * slope / max(real(4) * slope * slope - real(0.5) * value * curve, real(1e-24))
 
 
-@inline
+@leaf
 def _halley_thrice(s, I1, I2, J):
     """Unrolled: a loop would keep LLVM from vectorising the kernel around it."""
     return _halley(_halley(_halley(s, I1, I2, J), I1, I2, J), I1, I2, J)
 
 
-@inline
+@leaf
 def _trace_bound(I1, I2, J):
     """An upper bound on tr S, exact at rest: (s² - I1)² = 4 (I2 + 2 J s) is at most 12 I2, or 4 I2 if J <= 0."""
     real = type(I1)
@@ -166,7 +166,7 @@ def _(I1, I2, J):
     return double
 
 
-@inline
+@leaf
 def rotation(F):
     """Rotation R of the polar decomposition F = R S with det R = +1 always, also for det F <= 0; no SVD.
 
@@ -198,7 +198,7 @@ def rotation(F):
     )
 
 
-@inline
+@leaf
 def solve_spd(a00, a01, a02, a11, a12, a22, b0, b1, b2):
     """Solution of the symmetric positive definite 3x3 system with the given upper triangle, by cofactors."""
     c00 = a11 * a22 - a12 * a12

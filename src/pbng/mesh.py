@@ -223,6 +223,7 @@ class TetMesh(Mesh):
                 }[int(code)]
             )
         self.__dict__["surface"] = _frozen(surface)  # known already: faces are matched to find overlaps
+        self.__dict__["volume"] = _frozen(np.abs(volume))
         return cells, flipped
 
     @cached_property

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, prange
 
 from pbng.assembly import group_parameters
-from pbng.dispatch import specialised, term_pack
+from pbng.dispatch import call, specialised
 from pbng.elements.base import W
 from pbng.jit import FLAGS, inline, serial
 from pbng.problem import Problem
@@ -102,12 +102,13 @@ def pack_problem(problem: Problem, dtype=np.float32, paper_block: bool = False) 
 
     terms = tuple(dict.fromkeys(g.term for g in problem.groups))
     parameters, first = group_parameters(problem.groups, dtype, paper_block)
-    widths = [t.kind.width(t.model) for t in terms]
-    # For each group: term, parameters, indices a row, coefficients a row.
+    frames = [(g.kind, g.term.model.isotropic) for g in problem.groups]
+    packers = tuple(dict.fromkeys(kind.pack(isotropic) for kind, isotropic in frames))
+    # For each group: term, parameters, indices a row, coefficients a row, packer.
     table = np.array(
         [
-            (terms.index(g.term), p, W * g.kind.others, W * widths[terms.index(g.term)])
-            for g, p in zip(problem.groups, first)
+            (terms.index(g.term), p, W * kind.others, W * kind.width(iso), packers.index(kind.pack(iso)))
+            for g, p, (kind, iso) in zip(problem.groups, first, frames)
         ]
     )
     blocks = [g.block(paper_block) for g in problem.groups]
@@ -129,7 +130,7 @@ def pack_problem(problem: Problem, dtype=np.float32, paper_block: bool = False) 
         spans.append((seg_start, seg))
         sizes.append(len(seg))
     idx, coef = aligned(idx_at, np.uint32), aligned(coef_at, dtype)
-    fill = specialised(make_fill, terms)
+    fill = specialised(make_fill, packers)
     for kind, (seg_start, seg) in zip(kinds, spans):
         cells, group, start, incident = problem.incidences[kind]
         fill(
@@ -258,7 +259,7 @@ def make_fill(key: str):
                             idx[i + W * j] = 4 * slot[cells[e, opposite[a, j]]]
                         once = 1.0 if row < n and real[place] else 0.0
                         at = (NODAL * b + 3) * W + lane
-                        term_pack(key, seg[s, 0], (X, cells, e, a, opposite, once, coef, c, numbers[which], nodal, at))
+                        call(key, table[which, 4], (X, cells, e, a, opposite, once, coef, c, numbers[which], nodal, at))
                         i += table[which, 2]
                         c += table[which, 3]
                     k = end

@@ -10,7 +10,7 @@ One sub-iterate, Eqs. (28)-(34), for the 16 nodes of a block at once::
 import numpy as np
 from numba import get_num_threads, njit, prange, uint64
 
-from pbng.dispatch import specialised, term_sweep
+from pbng.dispatch import call, specialised
 from pbng.elements.base import AHEAD, W
 from pbng.jit import FLAGS, inline
 from pbng.linalg import solve_spd
@@ -30,19 +30,9 @@ def sweep(packed: Packed, x: np.ndarray, colors: np.ndarray, omega: float = 1.0)
         omega: Relaxation of each node's step; 0 < omega < 2 never raises the energy.
     """
     p = packed
-    specialised(make_sweep, p.terms)(
-        x,
-        colors,
-        p.color_start,
-        p.seg_start,
-        p.seg,
-        p.idx,
-        p.coef,
-        p.nodal,
-        p.parameters,
-        p.dtype.type(omega),
-        _grain(p),
-    )
+    run = specialised(make_sweep, tuple(t.kind.sweep(t.model) for t in p.terms))
+    omega, grain = p.dtype.type(omega), _grain(p)
+    run(x, colors, p.color_start, p.seg_start, p.seg, p.idx, p.coef, p.nodal, p.parameters, omega, grain)
 
 
 def _grain(packed: Packed) -> int:
@@ -66,7 +56,7 @@ def make_sweep(key: str):
                     _load(uint64(b), x, nodal, acc)
                     for s in range(seg_start[b], seg_start[b + 1]):
                         k, p, rows, i, c = seg[s]
-                        term_sweep(key, k, (rows, uint64(i), uint64(c), x, idx, coef, par, uint64(p), g, acc))
+                        call(key, k, (rows, uint64(i), uint64(c), x, idx, coef, par, uint64(p), g, acc))
                     _step(uint64(b), x, acc, omega)
 
     return run

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numba import uint64
 
-from pbng.jit import inline
+from pbng.jit import inline, leaf
 from pbng.materials.base import Model
 
 W = 16  # lanes: float32 fills one AVX-512 register; float64 is as fast with 16 as with 8
@@ -34,11 +34,11 @@ class ElementKind(ABC):
         return [*self.opposite[-1].tolist(), self.corners - 1]
 
     @abstractmethod
-    def width(self, model: Model) -> int:
+    def width(self, isotropic: bool) -> int:
         """Coefficients stored for one incidence."""
 
     @abstractmethod
-    def pack(self, model: Model) -> Any:
+    def pack(self, isotropic: bool) -> Any:
         """``(X, cells, e, a, opposite, once, coef, at, block, nodal, to)``: write the coefficients of corner a of
         element e to ``coef[at + W * j]`` and add the constant part of its Hessian to ``nodal[to + W * j]``; ``once`` is
         1, or 0 for a repeated incidence, which must have no effect."""
@@ -50,33 +50,29 @@ class ElementKind(ABC):
 
     @abstractmethod
     def energy(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, gx, gX, out)``: energy [J] of the first m of the W elements at
-        ``idx[i]``; the last three arguments are scratch."""
+        """``(m, i, x, X, idx, par, p, gx, gX, out, f, o) -> (energy [J], 0, 0)`` of the first m of the W elements at
+        ``idx[i]``; gx, gX and out are scratch, the last two arguments are not used."""
 
     @abstractmethod
     def forces(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, gx, gX, out, f, o)``: the same, with forces on corners written to ``f[o]``;
-        returns the energy, the sum of the norms of the elements' forces [N] and the number of inverted elements."""
-
-    @abstractmethod
-    def fingerprint(self, model: Model) -> str:
-        """Hash of the code of the functions above."""
+        """The same, with the forces on the elements' corners written to ``f[o]``; returns the energy, the sum of the
+        norms of the elements' forces [N] and the number of inverted elements."""
 
 
-@inline
+@leaf
 def vec(g, j):
     """Vector at position j of a scratch array of 4-component vectors, the fourth zero."""
     return g[j] + g[j + uint64(3)], g[j + uint64(1)], g[j + uint64(2)]
 
 
-@inline
+@leaf
 def wide_vec(g, j):
     """The same in float64."""
     a = vec(g, j)
     return np.float64(a[0]), np.float64(a[1]), np.float64(a[2])
 
 
-@inline
+@leaf
 def gather(n, i, x, idx, g, to):
     """Copy n * W positions to ``g[to:]``; ``idx[i:]`` holds their places in x, which are multiples of 4."""
     for l_ in range(n * W):

@@ -15,7 +15,7 @@ import numpy as np
 from numba import uint64
 
 from pbng.elements.base import AHEAD, ElementKind, W, gather, parameters, vec, wide_vec
-from pbng.jit import fingerprint, inline
+from pbng.jit import inline
 from pbng.linalg import add, cofactor, combine, combine3, cross, det, dot, mat_vec, scale, sub
 from pbng.materials.base import Model
 
@@ -82,11 +82,8 @@ class Simplex(ElementKind):
 
     plane = False
 
-    def width(self, model: Model) -> int:
-        return NODE_FRAME if model.isotropic else REST_FRAME
-
-    def fingerprint(self, model: Model) -> str:
-        return fingerprint(*(getattr(self, f)(model) for f in ("pack", "sweep", "energy", "forces")))
+    def width(self, isotropic: bool) -> int:
+        return NODE_FRAME if isotropic else REST_FRAME
 
     @property
     def share(self) -> float:
@@ -112,8 +109,8 @@ class Simplex(ElementKind):
         return edges
 
     @cache
-    def pack(self, model: Model) -> Any:
-        plane, isotropic, share = self.plane, model.isotropic, self.share
+    def pack(self, isotropic: bool) -> Any:
+        plane, share = self.plane, self.share
 
         @inline
         def pack(X, cells, e, a, opposite, once, coef, at, block, nodal, to):
@@ -141,7 +138,11 @@ class Simplex(ElementKind):
         others = self.others
         incidence = self._incidence(model)
         numbers = parameters(model.n_parameters)
-        idx_row, coef_row, positions = uint64(W * others), uint64(W * self.width(model)), uint64(4 * W * others)
+        idx_row, coef_row, positions = (
+            uint64(W * others),
+            uint64(W * self.width(model.isotropic)),
+            uint64(4 * W * others),
+        )
 
         @inline
         def sweep(n, i, c, x, idx, coef, par, p, g, acc):
@@ -219,7 +220,7 @@ class Simplex(ElementKind):
         numbers = parameters(model.n_parameters)
 
         @inline
-        def energy(m, i, x, X, idx, par, p, gx, gX, out):
+        def energy(m, i, x, X, idx, par, p, gx, gX, out, f, o):
             number = numbers(par, p + uint64(1))
             gather(corners, i, x, idx, gx, zero)
             gather(corners, i, X, idx, gX, zero)
@@ -230,7 +231,7 @@ class Simplex(ElementKind):
             total = 0.0
             for l_ in range(m):
                 total += out[uint64(l_)]
-            return total
+            return total, 0.0, 0
 
         return energy
 

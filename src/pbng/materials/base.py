@@ -11,7 +11,7 @@ from functools import cache, cached_property
 from typing import Any, ClassVar, NamedTuple, TypeVar, dataclass_transform
 
 from pbng.errors import InputError
-from pbng.jit import fingerprint, function
+from pbng.jit import function
 
 
 class Block(NamedTuple):
@@ -94,14 +94,13 @@ class Model(NamedTuple):
     stress: Callable[..., Any]
     n_parameters: int
     isotropic: bool
-    fingerprint: str
 
 
 @cache
 def model_of(cls: Any, n_parameters: int) -> Model:
     """The model of a material class; compiled when a kernel first needs it."""
     energy, stress = _compiled(cls, "energy"), _compiled(cls, "stress")
-    return Model(cls.__name__, energy, stress, n_parameters, cls.isotropic, fingerprint(energy, stress))
+    return Model(cls.__name__, energy, stress, n_parameters, cls.isotropic)
 
 
 def _compiled(cls: type[Material], name: str) -> Callable[..., Any]:

@@ -1,0 +1,191 @@
+"""The command line: ``pbng run``, ``demo``, ``list``, ``info``, ``view``, ``export``, ``bench``.
+
+What is heavy is imported inside the commands, so that ``pbng --help`` answers at once.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from pbng import __version__
+from pbng.cli_console import Commands, out, show_log, table, wrote
+from pbng.errors import InputError
+
+app = typer.Typer(
+    cls=Commands,
+    help="Equilibria of soft bodies by position-based nonlinear Gauss-Seidel.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the run that the folder holds.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"pbng {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error, and all that is logged.")
+    ] = False,
+) -> None:
+    """Equilibria of soft bodies by position-based nonlinear Gauss-Seidel."""
+    show_log(debug)
+
+
+@app.command()
+def run(
+    scene: Annotated[
+        str, typer.Argument(metavar="NAME|FILE.py", help="A scene of `pbng list`, or a file with scene().")
+    ],
+    surface: Annotated[
+        Path | None, typer.Argument(metavar="[MESH]", help="A file for scenes that take one, such as bent_surface.")
+    ] = None,
+    resolution: Annotated[
+        int | None, typer.Option(help="What it counts depends on the scene.", show_default=False)
+    ] = None,
+    solver: Annotated[
+        str | None,
+        typer.Option(help="anderson, plain, node-sor, sor, chebyshev; parameters after a colon: anderson:5, sor:1.7."),
+    ] = None,
+    iterations: Annotated[int | None, typer.Option(help="At most so many iterations a frame.")] = None,
+    rtol: Annotated[float | None, typer.Option(help="Until the residual of a frame is this part of its first.")] = None,
+    atol: Annotated[float | None, typer.Option(help="Until the residual is below this [N].")] = None,
+    seconds: Annotated[float | None, typer.Option(help="At most so many seconds a frame.")] = None,
+    dtype: Annotated[str | None, typer.Option(help="Precision of the sweeps: float32 or float64.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads to use; by default all.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Frames, the one at time 0 included.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
+    to: Annotated[Path | None, typer.Option("--out", help="Folder of the run; by default runs/NAME.")] = None,
+    overwrite: Overwrite = False,
+    view: Annotated[bool, typer.Option("--view/--no-view", help="Draw pictures and a film when it is done.")] = False,
+) -> None:
+    """Run a scene, frame by frame.
+
+    Limits of the budget that are given replace all of the scene's own.
+    """
+    from pbng import cli_options, cli_run
+    from pbng.cli_console import blaming
+    from pbng.jit import compile_seconds
+
+    with blaming(Path(scene)):
+        recipe, name, file = cli_options.recipe(scene, surface, resolution)
+    report = cli_run.run(
+        recipe,
+        to or Path("runs") / name,
+        solver=cli_options.solver(recipe.solver, solver, dtype, threads),
+        budget=cli_options.budget(recipe.budget, iterations, seconds, rtol, atol),
+        frames=frames,
+        fps=fps,
+        overwrite=overwrite,
+        file=file,
+        label=name,
+    )
+    cli_run.summarize(report, compile_seconds())
+    if report.results and not report.stopped:
+        out.print(f"wrote {len(report.results)} frames to {escape(str(report.path))}", soft_wrap=True)
+        if view:
+            _draw(report.path, None)
+        else:
+            out.print(f"[dim]look at it with:[/] pbng view {escape(str(report.path))}", soft_wrap=True)
+    cli_run.finish(report)
+
+
+@app.command()
+def demo(
+    to: Annotated[Path, typer.Option("--out", help="Folder for runs and pictures.")] = Path("runs/demo"),
+    resolution: Annotated[int, typer.Option(help="Vertices along an edge of the twisting block.")] = 24,
+) -> None:
+    """Twist a block and hang up a little dragon: runs, pictures, films and tables of residuals, in two minutes."""
+    from pbng.cli_demo import demo
+
+    demo(to, resolution)
+
+
+@app.command("list")
+def list_scenes() -> None:
+    """List the scenes of the gallery."""
+    from pbng.gallery import SCENES
+
+    shown = table("Scenes", pad_edge=False)
+    for heading in ("name", "what happens", "resolution", "paper"):
+        shown.add_column(heading)
+    for entry in SCENES.values():
+        name = f"{entry.name} \\[MESH]" if entry.takes_surface else entry.name
+        shown.add_row(name, entry.summary, entry.resolution, entry.figure)
+    out.print(shown)
+    out.print("[dim]run one with:[/] pbng run twisting_block --resolution 16")
+
+
+@app.command()
+def info(
+    what: Annotated[Path, typer.Argument(metavar="MESH|RUN", help="A file of a mesh, or the folder of a run.")],
+) -> None:
+    """Say what a mesh or a run is, and how good."""
+    from pbng.cli_info import mesh_rows, run_rows
+
+    shown = table(str(what), show_header=False, pad_edge=False)
+    for name, value in run_rows(what) if what.is_dir() else mesh_rows(what):
+        shown.add_row(name, value)
+    out.print(shown)
+
+
+@app.command()
+def view(
+    path: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")],
+    to: Annotated[Path | None, typer.Option("--out", help="Folder for the pictures; by default RUN_view.")] = None,
+) -> None:
+    """Draw a run: its last frame, a strip, a film and its residuals."""
+    _draw(path, to)
+
+
+@app.command()
+def export(
+    path: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")],
+    format: Annotated[str, typer.Option("--format", "-f", help="vtu, vtp, obj, ply or pc2.")] = "vtu",
+    to: Annotated[Path | None, typer.Option("--out", help="Folder for the files; by default RUN_FORMAT.")] = None,
+    split: Annotated[bool, typer.Option("--split", help="Each body into files of its own.")] = False,
+) -> None:
+    """Write a run in the format of another program (ParaView, Blender, Houdini)."""
+    from pbng.io.export import export
+
+    files = export(path, to or path.parent / f"{path.name}_{format}", format, split=split)
+    out.print(f"wrote {len(files)} files to {escape(str(files[-1].parent))}", soft_wrap=True)
+    out.print(f"[dim]open:[/] {escape(str(files[-1]))}", soft_wrap=True)
+
+
+@app.command(
+    add_help_option=False,
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
+)
+def bench(context: typer.Context) -> None:
+    """Measure: time of a sweep, convergence. See `pbng bench --help`."""
+    try:
+        from pbng.bench import app as benchmarks
+    except ModuleNotFoundError as error:
+        if error.name != "pbng.bench":
+            raise
+        raise InputError("this installation has no benchmarks (pbng.bench)") from None
+    benchmarks(args=context.args, prog_name="pbng bench", standalone_mode=False)
+
+
+def _draw(path: Path, to: Path | None) -> None:
+    from pbng.view import view
+
+    wrote(view(path, to))
+
+
+if __name__ == "__main__":
+    app()
