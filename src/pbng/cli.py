@@ -51,7 +51,7 @@ def run(
         str, typer.Argument(metavar="NAME|FILE.py", help="A scene of `pbng list`, or a file with scene().")
     ],
     surface: Annotated[
-        Path | None, typer.Argument(metavar="[MESH]", help="A file for scenes that take one, such as bent_surface.")
+        Path | None, typer.Argument(metavar="MESH", help="A file for scenes that take one, such as bent_surface.")
     ] = None,
     resolution: Annotated[
         int | None, typer.Option(help="What it counts depends on the scene.", show_default=False)
@@ -119,12 +119,12 @@ def list_scenes() -> None:
     """List the scenes of the gallery."""
     from pbng.gallery import SCENES
 
-    shown = table("Scenes", pad_edge=False)
-    for heading in ("name", "what happens", "resolution", "paper"):
+    shown = table(pad_edge=False)
+    for heading in ("scene", "paper", "what happens"):
         shown.add_column(heading)
     for entry in SCENES.values():
         name = f"{entry.name} \\[MESH]" if entry.takes_surface else entry.name
-        shown.add_row(name, entry.summary, entry.resolution, entry.figure)
+        shown.add_row(name, entry.figure, f"{entry.summary}\n[dim]--resolution: {entry.resolution}[/]")
     out.print(shown)
     out.print("[dim]run one with:[/] pbng run twisting_block --resolution 16")
 

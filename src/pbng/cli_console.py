@@ -59,17 +59,15 @@ def fail(message: str, debug: bool = False) -> NoReturn:
 
 def show_log(debug: bool) -> None:
     """Let the logger of the library speak through the console, so that it does not break a progress bar."""
+    from rich.highlighter import NullHighlighter
     from rich.logging import RichHandler
 
     log = logging.getLogger("pbng")
     for handler in [h for h in log.handlers if isinstance(h, RichHandler)]:
         log.removeHandler(handler)
-    log.addHandler(RichHandler(console=err, show_time=False, show_path=False, show_level=False, highlighter=_plain))
+    plain = NullHighlighter()
+    log.addHandler(RichHandler(console=err, show_time=False, show_path=False, show_level=False, highlighter=plain))
     log.setLevel(logging.DEBUG if debug else logging.WARNING)
-
-
-def _plain(text: Any) -> Any:
-    return text
 
 
 @contextmanager

@@ -66,7 +66,7 @@ def demo(path: Path, resolution: int) -> None:
 def _frames(results: list[Result], fps: float) -> object:
     """The certificates of a few frames."""
     shown = table(pad_edge=False)
-    for heading in ("t [s]", "iterations", "residual, start [N]", "end [N]", "ratio", "inverted", "ended"):
+    for heading in ("t [s]", "iterations", "residual, from [N]", "to [N]", "ratio", "inverted", "ended"):
         shown.add_column(heading, justify="left" if heading == "ended" else "right")
     for k in np.unique(np.linspace(0, len(results) - 1, ROWS).round().astype(int)):
         r = results[k]

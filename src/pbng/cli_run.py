@@ -72,11 +72,10 @@ def run(
         fps = recipe.fps if fps is None else fps
         frames = (recipe.frames or _until_the_end(problem, fps)) if frames is None else frames
         report = Report(path, problem, frames, fps)
-        with _progress(label or problem.name, frames, budget) as watch:
+        with _progress(label or problem.name, frames, budget) as watch, _folder(path):
+            writer = FrameWriter(path, fps=fps, overwrite=overwrite, info={"solver": repr(solver)})
             coming = simulate(problem, solver, budget, frames=frames, fps=fps, monitor=watch.monitor)
-            with _folder(path):
-                writer = FrameWriter(path, fps=fps, overwrite=overwrite, info={"solver": repr(solver)})
-                _write(coming, writer, watch, report)
+            _write(coming, writer, watch, report)
     return report
 
 
@@ -138,11 +137,11 @@ class _Bar(_Watch):
     def __init__(self, label: str, frames: int, budget: Budget, bar: Progress) -> None:
         super().__init__(label, frames)
         self.budget, self.bar = budget, bar
-        self.task = bar.add_task(label, total=frames, detail=f"frame 1 of {frames}")
+        self.task = bar.add_task(label, total=frames, detail=f"1/{frames}")
 
     def monitor(self, now: base.Progress) -> None:
         ratio = now.residual / now.first if now.first > 0 else 0.0
-        detail = f"frame {self.k + 1} of {self.frames} · {now.iteration} iterations · residual ratio {ratio:.1e}"
+        detail = f"{self.k + 1}/{self.frames} · {now.iteration:>4} iterations · ratio {ratio:.0e}"
         self.bar.update(self.task, completed=self.k + self._share(now), detail=detail)
 
     def _share(self, now: base.Progress) -> float:
@@ -166,7 +165,7 @@ def _progress(label: str, frames: int, budget: Budget) -> Iterator[_Watch]:
         return
     columns = (
         TextColumn("{task.description}"),
-        BarColumn(),
+        BarColumn(20),
         TextColumn("{task.fields[detail]}"),
         TimeRemainingColumn(),
     )

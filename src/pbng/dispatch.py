@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
+from numba.core.types import StringLiteral
 from numba.extending import overload
 
 from pbng.elements.base import ElementKind
@@ -41,6 +42,8 @@ def call(key, k, arguments):
 
 @overload(call, prefer_literal=True, jit_options={"forceinline": True, **FLAGS})
 def _(key, k, arguments):
+    if not isinstance(key, StringLiteral):
+        return None  # Numba also tries the plain type when a function does not compile
     functions = _FUNCTIONS[key.literal_value]
     if len(functions) == 1:
         (only,) = functions

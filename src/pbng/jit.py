@@ -12,6 +12,8 @@ import logging
 import time
 import types
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 from numba import njit
@@ -49,6 +51,8 @@ def _feed(digest: Any, value: Any, seen: set[int]) -> None:
         if id(value) in seen or (value.__module__ or "").partition(".")[0] in ("numba", "numpy", "math"):
             return
         seen.add(id(value))
+        if value.__module__.partition(".")[0] == "pbng":  # its file may hold overloads, which no byte code refers to
+            digest.update(_file_hash(value.__code__.co_filename))
         _feed(digest, value.__code__, seen)
         for name in sorted(_names(value.__code__)):
             if name in value.__globals__:
@@ -66,6 +70,11 @@ def _feed(digest: Any, value: Any, seen: set[int]) -> None:
     elif isinstance(value, bool | int | float | complex | str | bytes | type(None) | frozenset):
         digest.update(repr(sorted(value, key=repr) if isinstance(value, frozenset) else value).encode())
     # Modules, classes and NumPy scalars types are named by the code that uses them.
+
+
+@cache
+def _file_hash(path: str) -> bytes:
+    return hashlib.sha256(Path(path).read_bytes()).digest()
 
 
 def _names(code: types.CodeType) -> set[str]:

@@ -7,7 +7,6 @@ caller does not use of a result costs nothing.
 
 import math
 
-import numpy as np
 from numba import types
 from numba.extending import overload
 
@@ -124,14 +123,18 @@ def det(F):
 
 @leaf
 def _halley(s, I1, I2, J):
-    """One Halley step for the largest root of s⁴ - 2 I1 s² - 8 J s + I1² - 4 I2; from above it stays above."""
+    """One Halley step for the largest root of s⁴ - 2 I1 s² - 8 J s + I1² - 4 I2; from above it stays above.
+
+    All four roots are real, sums of the ±σ of fitting signs, which keeps the exact denominator above |b|; where it
+    comes out lower, near a double root, all is rounding, and |b| keeps the step small.
+    """
     real = type(s)
     q = s * s
     t = q - I1
     value = t * t - real(8) * J * s - real(4) * I2
     slope = s * t - real(2) * J  # a quarter of the derivative
-    curve = real(3) * q - I1  # a quarter of the second derivative
-    return s - value * slope / max(real(4) * slope * slope - real(0.5) * value * curve, real(1e-24))
+    b = real(0.5) * value * (real(3) * q - I1)  # with a quarter of the second derivative
+    return s - value * slope / max(real(4) * slope * slope - b, abs(b) + real(1e-37))
 
 
 @leaf
@@ -145,7 +148,7 @@ def _trace_bound(I1, I2, J):
     """An upper bound on tr S, exact at rest: (s² - I1)² = 4 (I2 + 2 J s) is at most 12 I2, or 4 I2 if J <= 0."""
     real = type(I1)
     bound = (real(12) if real(0) < J else real(4)) * max(I2, real(0))
-    return math.sqrt(I1 + math.sqrt(bound) + real(1e-12))
+    return math.sqrt(I1 + math.sqrt(bound) + real(1e-30))
 
 
 def _stretch_trace(I1, I2, J):
@@ -154,25 +157,24 @@ def _stretch_trace(I1, I2, J):
 
 @overload(_stretch_trace, jit_options={"forceinline": True, **FLAGS})
 def _(I1, I2, J):
-    """tr S to rounding: three steps in float32; in float64 as many with float32's cheap divisions, then two more."""
-    if types.float32 == I1:
+    """tr S to rounding: three steps in float32, seven in float64."""
+    if I1 is types.float32:
         return lambda I1, I2, J: _halley_thrice(_trace_bound(I1, I2, J), I1, I2, J)
 
     def double(I1, I2, J):
-        i1, i2, j = np.float32(I1), np.float32(I2), np.float32(J)
-        s = np.float64(_halley_thrice(_trace_bound(i1, i2, j), i1, i2, j))
-        return _halley(_halley(s, I1, I2, J), I1, I2, J)
+        s = _halley_thrice(_trace_bound(I1, I2, J), I1, I2, J)
+        return _halley(_halley_thrice(s, I1, I2, J), I1, I2, J)
 
     return double
 
 
 @leaf
-def rotation(F):
-    """Rotation R of the polar decomposition F = R S with det R = +1 always, also for det F <= 0; no SVD.
+def polar(F):
+    """R as :func:`rotation` and s = tr S = tr RᵀF, its largest value over rotations; no SVD.
 
-    The trace s of S is the largest root of a quartic in the invariants; R then follows in closed form (docs/method.md,
-    "Polar decomposition without an SVD"). Where R is not unique the denominator is clamped: R is finite, its columns
-    at most of unit length.
+    s is the largest root of a quartic in the invariants; R = ∂s/∂F then follows in closed form (docs/method.md, "Polar
+    decomposition without an SVD"). Where R is not unique both parts of the fraction vanish; with s a little too large
+    their ratio is the mean of the rotations that would do, a subgradient of s, so that blocks stay majorisers.
     """
     real = type(F[0][0])
     H = cofactor(F)
@@ -186,16 +188,24 @@ def rotation(F):
     I1 = C00 + C11 + C22
     I2 = dot(H[2], H[2]) + (C00 * C22 - C02 * C02) + (C11 * C22 - C12 * C12)  # |H|², with one column of H
     s = _stretch_trace(I1, I2, J)
-    q = s * s
-    d = real(1) / max(s * (q - I1) - real(2) * J, real(1e-6) * q * s)
+    t = real(1.001) * s if s * (s * s - I1) - real(2) * J < real(1e-6) * s * s * s else s
+    q = t * t
+    d = real(1) / (t * (q - I1) - real(2) * J + real(1e-37))
     m = (q + I1) * d
-    e = real(2) * s * d
+    e = real(2) * t * d
     k = real(2) * d
-    return (
+    R = (
         sub(combine(m - k * C00, F[0], e, H[0]), combine(k * C01, F[1], k * C02, F[2])),
         sub(combine(m - k * C11, F[1], e, H[1]), combine(k * C01, F[0], k * C12, F[2])),
         sub(combine(m - k * C22, F[2], e, H[2]), combine(k * C02, F[0], k * C12, F[1])),
     )
+    return R, s
+
+
+@leaf
+def rotation(F):
+    """Rotation R of the polar decomposition F = R S with det R = +1 always, also for det F <= 0; see :func:`polar`."""
+    return polar(F)[0]
 
 
 @leaf

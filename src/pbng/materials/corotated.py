@@ -1,6 +1,6 @@
 """Fixed corotated elasticity, Eq. (7) (Stomakhin et al. 2012)."""
 
-from pbng.linalg import cofactor, det, mat_combine, mat_sub, norm2, rotation
+from pbng.linalg import cofactor, det, mat_combine, mat_sub, norm2, polar, rotation
 from pbng.materials.base import Block, Material, material
 
 
@@ -10,8 +10,12 @@ class Corotated(Material):
 
     def energy(F, mu, lam):
         real = type(mu)
+        R, s = polar(F)
+        strain2 = norm2(F) - real(2) * s + real(3)  # |F - R|², also where R is not unique and comes out short
+        if strain2 < real(0.1):
+            strain2 = norm2(mat_sub(F, R))  # near rest, without the cancellation
         dJ = det(F) - real(1)
-        return mu * norm2(mat_sub(F, rotation(F))) + real(0.5) * lam * dJ * dJ
+        return mu * strain2 + real(0.5) * lam * dJ * dJ
 
     def stress(F, mu, lam):
         real = type(mu)

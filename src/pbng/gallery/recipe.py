@@ -1,0 +1,35 @@
+"""What a gallery function returns: a scene, and how it is meant to be run."""
+
+from dataclasses import dataclass, field
+
+from pbng.errors import InputError
+from pbng.scene import Scene
+from pbng.solvers.base import Budget, Solver
+from pbng.solvers.pbng import PBNG
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """A scene with the run that shows it best; ``pbng run`` takes what its options do not say from here.
+
+    Attributes:
+        scene: What is simulated.
+        frames: Frames, the one at time 0 included; by default as many as it takes for every motion to end.
+        fps: Frames a second [1/s].
+        solver: Who solves it.
+        budget: What each frame may take.
+    """
+
+    scene: Scene
+    frames: int | None = None
+    fps: float = 30.0
+    solver: Solver = field(default_factory=PBNG)
+    budget: Budget = field(default_factory=Budget)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.scene, Scene):
+            raise InputError(f"Recipe: scene must be a Scene, not {type(self.scene).__name__}")
+        if self.frames is not None and self.frames < 1:
+            raise InputError(f"Recipe: frames must be at least 1, not {self.frames}")
+        if not self.fps > 0:
+            raise InputError(f"Recipe: fps must be positive, not {self.fps}")
