@@ -15,9 +15,9 @@ from .mesh import Embedding as Embedding, TetMesh as TetMesh, TriMesh as TriMesh
 from .meshing import creature as creature, tetrahedralize as tetrahedralize
 from .motions import Animation as Animation, Motion as Motion, Rotate as Rotate, Scale as Scale, Translate as Translate
 from .problem import Problem as Problem
-from .quality import quality as quality
+from .mesh_quality import quality as quality
 from .scene import Body as Body, Scene as Scene, Selection as Selection
-from .simulate import Frame as Frame, simulate as simulate, solve as solve
+from .drivers import Frame as Frame, simulate as simulate, solve as solve
 from .solvers.acceleration import SOR as SOR, Anderson as Anderson, Chebyshev as Chebyshev, NodeSOR as NodeSOR
 from .solvers.base import Budget as Budget, Progress as Progress, Result as Result, Status as Status
 from .solvers.pbng import PBNG as PBNG

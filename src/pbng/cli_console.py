@@ -2,6 +2,7 @@
 
 import errno
 import logging
+import os
 import sys
 import traceback
 from collections.abc import Iterator
@@ -79,15 +80,18 @@ def blaming(file: Path | None) -> Iterator[None]:
         line = None if file is None else _line_in(file, error)
         if line is None:
             raise
-        what = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{file}, line {line}: {what}") from error
+        said = error.msg if isinstance(error, SyntaxError) else str(error)
+        what = said if isinstance(error, InputError) else f"{type(error).__name__}: {said}"
+        notes = "".join(f"; {note}" for note in getattr(error, "__notes__", ()))
+        raise InputError(f"{file}, line {line}: {what}{notes}") from error
 
 
 def _line_in(file: Path, error: BaseException) -> int | None:
     """The line of the file in which the error arose, or from which what raised it was called."""
-    if isinstance(error, SyntaxError) and error.filename == str(file):
+    path = os.path.abspath(file)  # which is how Python names the files it imports
+    if isinstance(error, SyntaxError) and error.filename == path:
         return error.lineno
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(file)]
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == path]
     return lines[-1] if lines else None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from pbng.errors import InputError
 from pbng.io.frames import read_run
 from pbng.io.meshes import MESHES, SURFACES, read_mesh, read_surface
-from pbng.quality import quality
+from pbng.mesh_quality import quality
 
 Rows = Iterator[tuple[str, str]]
 

@@ -19,20 +19,21 @@ from pbng.errors import InputError
 from pbng.gallery.recipe import Recipe
 from pbng.io.frames import FrameWriter
 from pbng.problem import Problem
-from pbng.simulate import simulate
+from pbng.drivers import simulate
 from pbng.solvers import base
 from pbng.solvers.base import Budget, Result, Solver, Status
 
 
 @dataclass(eq=False)
 class Report:
-    """What a run came to: the result of each frame (without its positions), and whether it went to the end."""
+    """What a run came to: the result of each frame (without its positions), and why it stopped if before the end."""
 
     path: Path
     problem: Problem
     frames: int
     fps: float
     results: list[Result] = field(default_factory=list)
+    written: int = 0
     stopped: str = ""
     exit_code: int = 0
 
@@ -97,6 +98,12 @@ def _write(coming: Iterator[Any], writer: FrameWriter, watch: "_Watch", report: 
             watch.done(frame)
     except KeyboardInterrupt:
         report.stopped, report.exit_code = "Interrupted.", INTERRUPTED
+    except Exception as error:
+        if writer.n_written:
+            error.add_note(f"the {writer.n_written} frames before it are intact in {report.path}")
+        raise
+    finally:
+        report.written = writer.n_written
 
 
 @contextmanager
@@ -186,9 +193,9 @@ def summarize(report: Report, compiled: float) -> None:
 
 
 def _kept(report: Report) -> str:
-    if not report.results:
+    if not report.written:
         return "No frame was finished; nothing was written."
-    return f"{len(report.results)} of {report.frames} frames are intact in {escape(str(report.path))}."
+    return f"{report.written} of {report.frames} frames are intact in {escape(str(report.path))}."
 
 
 def _rows(report: Report, results: list[Result], compiled: float) -> Iterator[tuple[str, str]]:

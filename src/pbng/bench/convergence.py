@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from pbng.bench.scenes import MODELS, box, hard_start
-from pbng.simulate import solve
+from pbng.drivers import solve
 from pbng.solvers.acceleration import SOR, Anderson, Chebyshev, NodeSOR
 from pbng.solvers.base import Budget, Result
 from pbng.solvers.pbng import PBNG

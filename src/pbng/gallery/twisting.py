@@ -12,7 +12,7 @@ from pbng.shapes import box
 from pbng.solvers.base import Budget
 
 E, NU, DENSITY = 1e5, 0.3, 10.0  # Pa, -, kg/m³
-SQUEEZE, STRETCH = 0.6, 1.4  # seconds of the two parts of the motion
+SQUEEZE, STRETCH = 0.5, 1.5  # seconds of the two parts of the motion
 SPACING = 1.6  # m from block to block: the twisted ends are 1.41 m from corner to corner
 # The paper's big budget (its low one is 6 iterations a frame), less where the residual is small or was from the start.
 BUDGET = Budget(iterations=40, rtol=1e-3, atol=1.0)

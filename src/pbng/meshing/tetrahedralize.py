@@ -12,7 +12,7 @@ from pbng.errors import InputError
 from pbng.mesh import TetMesh, TriMesh, triangle_areas
 from pbng.meshing.embedding import embed, load_igl
 from pbng.meshing.stuffing import stuff
-from pbng.quality import cone_volumes, triangles_at_edges
+from pbng.mesh_quality import cone_volumes, triangles_at_edges
 
 log = logging.getLogger("pbng")
 
