@@ -1,6 +1,7 @@
 """The public names: what type checkers read, and what ``__init__.py`` loads lazily."""
 
 from . import gallery as gallery, linalg as linalg, shapes as shapes, view as view
+from .drivers import Frame as Frame, simulate as simulate, solve as solve
 from .errors import InputError as InputError
 from .io.export import export as export
 from .io.frames import FrameWriter as FrameWriter, read_run as read_run
@@ -12,12 +13,11 @@ from .materials.linear import LinearElastic as LinearElastic
 from .materials.neo_hookean import NeoHookean as NeoHookean
 from .materials.stable_neo_hookean import StableNeoHookean as StableNeoHookean
 from .mesh import Embedding as Embedding, TetMesh as TetMesh, TriMesh as TriMesh
+from .mesh_quality import quality as quality
 from .meshing import creature as creature, tetrahedralize as tetrahedralize
 from .motions import Animation as Animation, Motion as Motion, Rotate as Rotate, Scale as Scale, Translate as Translate
 from .problem import Problem as Problem
-from .mesh_quality import quality as quality
 from .scene import Body as Body, Scene as Scene, Selection as Selection
-from .drivers import Frame as Frame, simulate as simulate, solve as solve
 from .solvers.acceleration import SOR as SOR, Anderson as Anderson, Chebyshev as Chebyshev, NodeSOR as NodeSOR
 from .solvers.base import Budget as Budget, Progress as Progress, Result as Result, Status as Status
 from .solvers.pbng import PBNG as PBNG

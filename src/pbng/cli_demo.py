@@ -9,10 +9,10 @@ from rich.markup import escape
 
 from pbng import cli_run
 from pbng.cli_console import err, out, table
+from pbng.drivers import solve
 from pbng.errors import InputError
 from pbng.gallery import find
 from pbng.jit import compile_seconds
-from pbng.drivers import solve
 from pbng.solvers.acceleration import Anderson, NodeSOR
 from pbng.solvers.base import Budget, Result
 from pbng.solvers.pbng import PBNG

@@ -15,11 +15,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pbng.cli_console import FAILED, INTERRUPTED, blaming, err, out, table
+from pbng.drivers import simulate
 from pbng.errors import InputError
 from pbng.gallery.recipe import Recipe
 from pbng.io.frames import FrameWriter
 from pbng.problem import Problem
-from pbng.drivers import simulate
 from pbng.solvers import base
 from pbng.solvers.base import Budget, Result, Solver, Status
 

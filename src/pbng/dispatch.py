@@ -1,30 +1,21 @@
 """How a kernel calls the functions of whatever elements and materials a problem holds.
 
-A *term* is an element kind together with a material model. A kernel is made for a tuple of functions, one a term, which
-it knows by a string, their key (see :mod:`pbng.jit`); where it says ``call(key, k, arguments)``, Numba's overload
-resolution puts one branch a function in place, and everything is inlined. One kernel thus serves a mesh of several
-materials, and a user's material costs what a built-in of the same arithmetic costs.
+A kernel is made for a tuple of functions, one a term (an element kind with a material model), which it knows by a
+string, their key (see :mod:`pbng.jit`). Where it says ``call(key, k, arguments)``, Numba's overload resolution puts one
+branch a function in place, and everything is inlined. One kernel thus serves a mesh of several materials, and a user's
+material costs what a built-in of the same arithmetic costs.
 """
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from numba.core.types import StringLiteral
 from numba.extending import overload
 
-from pbng.elements.base import ElementKind
 from pbng.jit import FLAGS, fingerprint, inline
-from pbng.materials.base import Model
 
 _FUNCTIONS: dict[str, tuple[Any, ...]] = {}
-
-
-class Term(NamedTuple):
-    """An element kind with a material model."""
-
-    kind: ElementKind
-    model: Model
 
 
 @cache

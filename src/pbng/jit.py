@@ -4,7 +4,7 @@ Numba caches a compiled kernel on disk, but its cache has two gaps that matter h
 function that the kernel calls from another file, and it never hits when a kernel receives or closes over another
 compiled function. Both are closed by giving a kernel one string in place of functions: a *key* that names what to call
 and carries a fingerprint of everything reachable. A string in a closure is part of Numba's cache index and a literal
-type at compile time, so that :func:`pbng.dispatch.call_row` can find the functions by it.
+type at compile time, so that :func:`pbng.dispatch.call` can find the functions by it.
 """
 
 import hashlib

@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from pbng.assembly import ElementBlocks
 from pbng.coloring import color_nodes, morton
-from pbng.dispatch import Term
-from pbng.elements.base import ElementKind
+from pbng.elements.base import ElementKind, Term
 from pbng.errors import InputError
 from pbng.materials.base import Block, Material, model_of
 from pbng.mesh import Mesh
@@ -26,8 +26,9 @@ class ElementGroup:
 
     @cached_property
     def term(self) -> Term:
-        """The element kind with the material's model: what kernels are specialised to."""
-        return Term(self.kind, model_of(type(self.material), len(self.material.parameters())))
+        """The element kind with the material's model."""
+        material: Any = type(self.material)
+        return Term(self.kind, model_of(material, len(self.material.parameters())))
 
     def block(self, paper: bool = False) -> Block:
         """The material's majorising block, or the paper's (Eq. 32)."""

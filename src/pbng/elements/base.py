@@ -7,7 +7,7 @@ fourth zero: reading it too keeps the loads of a lane free of gaps.
 
 from abc import ABC, abstractmethod
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numba import uint64
@@ -57,6 +57,13 @@ class ElementKind(ABC):
     def forces(self, model: Model) -> Any:
         """The same, with the forces on the elements' corners written to ``f[o]``; returns the energy, the sum of the
         norms of the elements' forces [N] and the number of inverted elements."""
+
+
+class Term(NamedTuple):
+    """An element kind with a material model: what kernels are specialised to."""
+
+    kind: ElementKind
+    model: Model
 
 
 @leaf

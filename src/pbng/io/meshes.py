@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from pbng.errors import InputError
-from pbng.io.store import mesh_arrays, packed, put, unpacked
-from pbng.io.store import read_mesh as read_stored
+from pbng.io.store import mesh_arrays, packed, put, read_mesh as read_stored, unpacked
 from pbng.mesh import TetMesh, TriMesh, triangle_areas
 
 log = logging.getLogger("pbng")

@@ -10,9 +10,9 @@ import numpy as np
 
 from pbng.errors import InputError
 from pbng.mesh import TetMesh, TriMesh, triangle_areas
+from pbng.mesh_quality import cone_volumes, triangles_at_edges
 from pbng.meshing.embedding import embed, load_igl
 from pbng.meshing.stuffing import stuff
-from pbng.mesh_quality import cone_volumes, triangles_at_edges
 
 log = logging.getLogger("pbng")
 
