@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numba import njit
 from numba.core import event
 
@@ -36,6 +37,9 @@ kernel = njit(parallel=True, cache=True, **FLAGS)  # a module-level parallel loo
 serial = njit(cache=True, error_model="numpy")  # a module-level serial loop, cached on disk
 
 
+_FOREIGN = ("numba", "numpy", "math", "builtins")  # what Numba compiles by name
+
+
 def fingerprint(*functions: Callable[..., Any]) -> str:
     """Hash of the byte code and constants of functions and of everything of pbng's or the user's that they call."""
     digest = hashlib.sha256()
@@ -48,15 +52,20 @@ def fingerprint(*functions: Callable[..., Any]) -> str:
 def _feed(digest: Any, value: Any, seen: set[int]) -> None:
     value = getattr(value, "py_func", value)
     if isinstance(value, types.FunctionType):
-        if id(value) in seen or (value.__module__ or "").partition(".")[0] in ("numba", "numpy", "math"):
+        if id(value) in seen or (value.__module__ or "").partition(".")[0] in _FOREIGN:
             return
         seen.add(id(value))
         if value.__module__.partition(".")[0] == "pbng":  # its file may hold overloads, which no byte code refers to
             digest.update(_file_hash(value.__code__.co_filename))
         _feed(digest, value.__code__, seen)
-        for name in sorted(_names(value.__code__)):
-            if name in value.__globals__:
-                _feed(digest, value.__globals__[name], seen)
+        names = sorted(_names(value.__code__))
+        for name in names:
+            found = value.__globals__.get(name)
+            if isinstance(found, types.ModuleType) and found.__name__.partition(".")[0] not in _FOREIGN:
+                for attribute in names:
+                    _feed(digest, getattr(found, attribute, None), seen)
+            else:
+                _feed(digest, found, seen)
         for cell in value.__closure__ or ():
             _feed(digest, cell.cell_contents, seen)
     elif isinstance(value, types.CodeType):
@@ -67,9 +76,11 @@ def _feed(digest: Any, value: Any, seen: set[int]) -> None:
     elif isinstance(value, tuple):
         for item in value:
             _feed(digest, item, seen)
-    elif isinstance(value, bool | int | float | complex | str | bytes | type(None) | frozenset):
+    elif isinstance(value, np.ndarray):
+        digest.update(repr((value.dtype, value.shape)).encode() + value.tobytes())
+    elif isinstance(value, bool | int | np.generic | float | complex | str | bytes | type(None) | frozenset):
         digest.update(repr(sorted(value, key=repr) if isinstance(value, frozenset) else value).encode())
-    # Modules, classes and NumPy scalars types are named by the code that uses them.
+    # Classes are named by the code that uses them.
 
 
 @cache

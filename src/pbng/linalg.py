@@ -211,16 +211,20 @@ def rotation(F):
 
 @leaf
 def solve_spd(a00, a01, a02, a11, a12, a22, b0, b1, b2):
-    """Solution of the symmetric positive definite 3x3 system with the given upper triangle, by cofactors."""
-    c00 = a11 * a22 - a12 * a12
-    c01 = a02 * a12 - a01 * a22
-    c02 = a01 * a12 - a02 * a11
-    c11 = a00 * a22 - a02 * a02
-    c12 = a01 * a02 - a00 * a12
-    c22 = a00 * a11 - a01 * a01
-    d = type(a00)(1) / (a00 * c00 + a01 * c01 + a02 * c02)
-    return (
-        (c00 * b0 + c01 * b1 + c02 * b2) * d,
-        (c01 * b0 + c11 * b1 + c12 * b2) * d,
-        (c02 * b0 + c12 * b1 + c22 * b2) * d,
-    )
+    """Solution of the symmetric positive definite 3x3 system with the given upper triangle, by A = L D Lᵀ.
+
+    Unlike cofactors this neither overflows nor breaks down where the rank-one part of a block drowns the rest; pivots
+    lost in rounding are raised, which makes A larger, so that a majoriser remains one.
+    """
+    real = type(a00)
+    r0 = real(1) / a00
+    l1 = a01 * r0
+    l2 = a02 * r0
+    r1 = real(1) / max(a11 - l1 * a01, real(1e-6) * a11)
+    m = a12 - l1 * a02
+    l3 = m * r1
+    r2 = real(1) / max(a22 - l2 * a02 - l3 * m, real(1e-6) * a22)
+    y1 = b1 - l1 * b0
+    z = (b2 - l2 * b0 - l3 * y1) * r2
+    y = y1 * r1 - l3 * z
+    return b0 * r0 - l1 * y - l2 * z, y, z

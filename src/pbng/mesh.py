@@ -85,6 +85,8 @@ class Mesh:
         out = {}
         for name, members in groups.items():
             index = np.asarray(members)
+            if index.dtype == bool and index.shape != (n,):
+                raise InputError(f"group {name!r}: a mask must have shape ({n},), not {index.shape}")
             index = np.flatnonzero(index) if index.dtype == bool else index.astype(np.int64).ravel()
             if len(index) and (index.min() < 0 or index.max() >= n):
                 raise InputError(f"group {name!r} names a {what} outside 0 .. {n - 1}")

@@ -12,7 +12,12 @@ from pbng.errors import InputError
 
 
 class Motion(ABC):
-    """Where prescribed vertices go: ``at(X, center, s, t)`` for the share s in [0, 1] of the motion and time t [s]."""
+    """Where prescribed vertices go: ``at(X, center, s, t)`` for the share s in [0, 1] of the motion and time t [s].
+
+    ``end`` is the time [s] at which a motion with a clock of its own has ended.
+    """
+
+    end = 0.0
 
     @abstractmethod
     def at(self, X: np.ndarray, center: np.ndarray, s: float, t: float) -> np.ndarray:
@@ -125,6 +130,10 @@ class Sum(Motion):
     first: Motion
     second: Motion
 
+    @property
+    def end(self) -> float:  # type: ignore[override]
+        return max(self.first.end, self.second.end)
+
     def at(self, X: np.ndarray, center: np.ndarray, s: float, t: float) -> np.ndarray:
         return self.first.at(X, center, s, t) + self.second.at(X, center, s, t) - X
 
@@ -145,6 +154,7 @@ class Animation(Motion):
         if not (np.isfinite(times).all() and np.isfinite(positions).all()):
             raise InputError("Animation: times and positions must be finite")
         object.__setattr__(self, "times", times)
+        object.__setattr__(self, "end", float(times[-1]))
         object.__setattr__(self, "positions", positions)
 
     def at(self, X: np.ndarray, center: np.ndarray, s: float, t: float) -> np.ndarray:

@@ -188,6 +188,9 @@ class Scene:
         f_ext = np.outer(mass, self.gravity)
         for index, force in self._forces:
             np.add.at(f_ext, index, force)
+        for b in self.bodies:
+            if isinstance(b.mesh, TriMesh):
+                f_ext[b.start : b.start + b.mesh.n_vert, 2] = 0  # plane strain: z never moves
         prescribed = _Prescribed(X, self._moves)
         fixed = np.zeros(len(X), bool)
         fixed[prescribed.index] = True
@@ -242,7 +245,7 @@ class _Prescribed:
                 )
         self.X = X
         self.index = np.flatnonzero(owner >= 0)
-        self.end = max((m.start + m.over for m in moves), default=0.0)
+        self.end = max((max(m.start + m.over, m.motion.end if m.motion else 0.0) for m in moves), default=0.0)
 
     def __call__(self, t: float) -> np.ndarray:
         x = self.X.copy()

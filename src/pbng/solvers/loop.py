@@ -26,6 +26,8 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
     certify(0)
     first, floor = history.last.residual, method.floor()
     tolerance = budget.tolerance(first)
+    if budget.rtol is not None and first <= floor:
+        tolerance = max(tolerance, floor)  # at rest already: a fraction of rounding cannot be asked for
     status = _verdict(history, tolerance, floor)
     iteration, correction = 0, 0.0
     try:
