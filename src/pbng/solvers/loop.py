@@ -34,7 +34,7 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
         while status is None:
             if iteration >= budget.cap:
                 status = Status.ITERATIONS
-            elif budget.seconds is not None and clock.seconds() >= budget.seconds:
+            elif budget.seconds is not None and clock.seconds() >= budget.seconds and (iteration or not budget.seconds):
                 status = Status.SECONDS
             else:
                 due = (iteration + 1) % budget.every == 0

@@ -1,8 +1,6 @@
 """Position-based nonlinear Gauss-Seidel (section 7): coloured sweeps, accelerated."""
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +14,7 @@ from pbng.packing import pack_problem
 from pbng.problem import Problem
 from pbng.solvers.acceleration import Acceleration, Anderson, Iteration, NodeSOR
 from pbng.solvers.base import Certificate
+from pbng.solvers.threads import Threads
 from pbng.sweep import sweep
 
 
@@ -29,7 +28,7 @@ class PBNG:
         block: "majorizer", for which no node update can raise the energy, or "paper" for Eq. (32).
         dtype: Precision of the sweeps, "float32" or "float64"; residuals and energies are always float64.
         symmetric: Follow each sweep by one in reverse order of the colours (one iteration is then two sweeps).
-        threads: Threads; by default all that Numba was given. Use 1 if other work keeps the machine's cores busy.
+        threads: Threads; by default as many as prove fastest, up to all that Numba has. Results do not depend on it.
         device: Only "cpu".
     """
 
@@ -71,8 +70,9 @@ class PackedMethod:
 
     def __init__(self, problem: Problem, solver: PBNG) -> None:
         self.problem, self.solver = problem, solver
+        self.threads = Threads(solver.threads)
         start = time.perf_counter() - compile_seconds()
-        with self._threads():
+        with self.threads.used():
             self.packed = pack_problem(problem, np.dtype(solver.dtype), solver.block == "paper")
             self.blocks = ElementBlocks(problem.groups, problem.X, self.packed.slot, self.packed.n_slot)
         forward = np.arange(len(self.packed.color_start) - 1)
@@ -93,12 +93,12 @@ class PackedMethod:
 
     def step(self) -> None:
         assert self.iteration is not None, "start() comes first"
-        with self._threads():
+        with self.threads.timed_step():
             self.iteration.step(self.x)
 
     def settle(self) -> None:
         if self.iteration is not None:
-            with self._threads():
+            with self.threads.used():
                 self.iteration.settle(self.x)
 
     def state(self) -> np.ndarray:
@@ -111,7 +111,7 @@ class PackedMethod:
         return self.blocks.energy(x) - self._work(x)
 
     def certify(self) -> Certificate:
-        with self._threads():
+        with self.threads.used():
             found = self.blocks.forces(self.x, self.forces)
             total = self.forces[: self.n_free] + self.f_ext[: self.n_free]
             energy = found.energy - self._work(self.x)
@@ -125,13 +125,3 @@ class PackedMethod:
     def _work(self, x: np.ndarray) -> float:
         """Work [J] of the external forces since rest."""
         return float(self.f_ext @ (x - self.blocks.X)) if self.loaded else 0.0
-
-    @contextmanager
-    def _threads(self) -> Iterator[None]:
-        before = numba.get_num_threads()
-        if self.solver.threads is not None:
-            numba.set_num_threads(self.solver.threads)
-        try:
-            yield
-        finally:
-            numba.set_num_threads(before)
