@@ -10,7 +10,7 @@ import pytest
 from pbng.errors import InputError
 from pbng.mesh import TetMesh, TriMesh
 from pbng.meshing import creature, embed, stuff, tetrahedralize
-from pbng.quality import cone_volumes, dihedral_angles, quality
+from pbng.mesh_quality import cone_volumes, dihedral_angles, quality
 from pbng.shapes import box
 
 igl_needed = pytest.mark.skipif(find_spec("igl") is None, reason="needs libigl")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pbng.mesh import TetMesh, TriMesh
-from pbng.quality import corner_angles, dihedral_angles, mean_ratio, quality
+from pbng.mesh_quality import corner_angles, dihedral_angles, mean_ratio, quality
 from pbng.shapes import box
 
 REGULAR = TetMesh(np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]]), np.array([[0, 1, 2, 3]]))

@@ -66,7 +66,7 @@ def demo(path: Path, resolution: int) -> None:
 def _frames(results: list[Result], fps: float) -> object:
     """The certificates of a few frames."""
     shown = table(pad_edge=False)
-    for heading in ("t [s]", "iterations", "residual, from [N]", "to [N]", "ratio", "inverted", "ended"):
+    for heading in ("t [s]", "iterations", "residual \\[N]", "at the end", "ratio", "inverted", "ended"):
         shown.add_column(heading, justify="left" if heading == "ended" else "right")
     for k in np.unique(np.linspace(0, len(results) - 1, ROWS).round().astype(int)):
         r = results[k]
@@ -97,4 +97,4 @@ def _compare(file: Path) -> Path:
     for name, solver in solvers.items():
         result = solve(problem, solver, budget)
         curves[name] = result.monitored, result.residuals
-    return plot_residuals(curves, file, title="Twisted by half a turn and stretched to twice its length at once")
+    return plot_residuals(curves, file, title="Twisted and stretched in one step")

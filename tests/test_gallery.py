@@ -1,0 +1,125 @@
+"""Scenes of the gallery: each one runs at a tiny size, and what its words promise is so."""
+
+import inspect
+import math
+import re
+
+import numpy as np
+import pytest
+
+import pbng
+from pbng.gallery import SCENES, find, gravity
+from pbng.gallery.motion import Eased
+from pbng.gallery.recipe import Recipe
+
+TINY = {"resolutions": 8, "hanging_bar": 3, "bent_surface": 10}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_first_frames_of_every_scene_converge(name):
+    recipe = SCENES[name](resolution=TINY.get(name, 4))
+    frames = list(pbng.simulate(recipe.scene, recipe.solver, recipe.budget, frames=3, fps=recipe.fps))
+    assert [f.result.status for f in frames] == [pbng.Status.CONVERGED] * 3
+    assert all(f.result.inverted == 0 for f in frames)
+    assert recipe.scene.name == name
+    moved = frames[2].problem.prescribed(2 / recipe.fps) - frames[0].problem.prescribed(0.0)
+    assert np.abs(moved).max() > 1e-4, "nothing would be seen to happen"
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_entry_tells_the_default_resolution(name):
+    function = getattr(pbng.gallery, name)
+    default = inspect.signature(function).parameters["resolution"].default
+    assert int(re.findall(r"\d+", SCENES[name].resolution)[-1]) == default
+    assert SCENES[name].takes_surface == ("surface" in inspect.signature(function).parameters)
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("resolution", [1, 0, -3])
+def test_resolution_too_low_is_named(name, resolution):
+    with pytest.raises(pbng.InputError, match=str(resolution)):
+        SCENES[name](resolution=resolution)
+
+
+def test_block_without_free_vertices_runs():
+    recipe = find("twisting_block")(resolution=2)
+    assert pbng.solve(recipe.scene, recipe.solver, recipe.budget).status is pbng.Status.CONVERGED
+
+
+def test_block_ends_stretched_to_two_metres_and_twisted_by_half_a_turn():
+    problem = find("twisting_block")(resolution=3).scene.compile()
+    assert problem.end == pytest.approx(2.0)
+    X, x = problem.X[problem.fixed], problem.prescribed(problem.end)
+    low, high = X[:, 0] < 0, X[:, 0] > 0
+    assert x[low, 0] == pytest.approx(-1.0)
+    assert x[high, 0] == pytest.approx(1.0)
+    angle = [math.atan2(*(x[side & (X[:, 1] == 0.5) & (X[:, 2] == 0)][0, [2, 1]])) for side in (low, high)]
+    assert abs(angle[1] - angle[0]) == pytest.approx(math.pi)
+
+
+def test_three_models_are_three():
+    problem = find("constitutive_models")(resolution=3).scene.compile()
+    assert [type(g.material).__name__ for g in problem.groups] == ["Corotated", "StableNeoHookean", "NeoHookean"]
+
+
+@pytest.mark.parametrize("longest", [0, 1, 2])
+def test_bodies_are_laid_along_x_without_mirroring(longest):
+    size = np.roll([2.0, 0.6, 0.5], longest)
+    mesh = pbng.shapes.box(size, 3)
+    laid = gravity.laid_along_x(mesh)
+    assert np.ptp(laid.X, axis=0).argmax() == 0
+    assert len(laid.flipped) == 0
+    assert laid.volume == pytest.approx(mesh.volume)
+
+
+def test_softness_of_a_beam_is_that_of_beam_theory():
+    mesh = pbng.shapes.box((2.0, 0.1, 0.1), (161, 3, 3))
+    area, free, sag = 0.01, 2.0 * (1 - gravity.HELD), 2.0 * gravity.SAG
+    load = gravity.DENSITY * gravity.GRAVITY * area  # N/m
+    exact = load * free**4 / (8 * area**2 / (4 * math.pi) * sag)  # w = q L⁴ / 8 E I
+    for end in (1, -1):
+        assert gravity.softness(mesh, end) == pytest.approx(exact, rel=0.03)
+
+
+def test_bodies_are_held_by_the_thick_end():
+    box = pbng.shapes.box((1.0, 0.3, 0.3), (21, 5, 5), (0.0, -0.15, -0.15))
+    for taper, held in ((-0.8, 0.0), (0.8, 1.0)):
+        scale = 1 + taper * (box.X[:, 0] - 0.5)
+        mesh = pbng.TetMesh(np.column_stack([box.X[:, 0], box.X[:, 1] * scale, box.X[:, 2] * scale]), box.cells)
+        problem = gravity.bent_surface(mesh).scene.compile()
+        assert np.abs(problem.X[problem.fixed, 0] - held).max() <= gravity.HELD + 1e-9
+
+
+def test_bent_surface_reads_files(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("igl")
+    file = tmp_path / "bar.obj"
+    trimesh.creation.box((0.2, 1.0, 0.2)).export(file)
+    body = find("bent_surface")(surface=file, resolution=8).scene.bodies[0]
+    assert body.mesh.skin is not None
+    assert np.ptp(body.mesh.X, axis=0).argmax() == 0
+    with pytest.raises(pbng.InputError, match=r"nothing\.obj"):
+        find("bent_surface")(surface=tmp_path / "nothing.obj")
+
+
+def test_eased_motion_begins_and_ends_where_the_motion_does():
+    X, motion = np.eye(3), pbng.Translate((1.0, 2.0, 3.0))
+    center = X.mean(0)
+    for s in (0.0, 0.5, 1.0):
+        assert Eased(motion).at(X, center, s, 0.0) == pytest.approx(motion.at(X, center, s, 0.0))
+    slow = Eased(motion).at(X, center, 0.01, 0.0) - X
+    assert np.abs(slow).max() < 1e-3
+
+
+def test_recipe_refuses_what_it_cannot_run():
+    scene = pbng.Scene()
+    for wrong in ({"scene": 3}, {"frames": 0}, {"fps": 0.0}):
+        with pytest.raises(pbng.InputError, match=next(iter(wrong))):
+            Recipe(**{"scene": scene, **wrong})
+
+
+def test_unknown_scene_names_its_neighbours():
+    with pytest.raises(pbng.InputError, match="twisting_block"):
+        find("twistingblock")
+    with pytest.raises(pbng.InputError, match="hanging_bar"):
+        find("zzz")
