@@ -369,10 +369,7 @@ SOURCES = {
 }
 
 
-blind = pytest.mark.xfail(strict=True, reason="core: jit.fingerprint does not look into modules of modules")
-
-
-@pytest.mark.parametrize("what", [pytest.param(w, marks=blind if "module in" in w else ()) for w in SOURCES])
+@pytest.mark.parametrize("what", SOURCES)
 def test_fingerprint_sees_everything_a_function_calls(what):
     """Kernels are found by the fingerprint of their functions: what changes a result must change it (see jit.py)."""
 

@@ -9,8 +9,8 @@ import pytest
 
 from pbng.errors import InputError
 from pbng.mesh import TetMesh, TriMesh
-from pbng.meshing import creature, embed, stuff, tetrahedralize
 from pbng.mesh_quality import cone_volumes, dihedral_angles, quality
+from pbng.meshing import creature, embed, stuff, tetrahedralize
 from pbng.shapes import box
 
 igl_needed = pytest.mark.skipif(find_spec("igl") is None, reason="needs libigl")

@@ -231,13 +231,36 @@ def test_rest_converges_at_once():
     np.testing.assert_array_equal(result.x, problem.X)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_rest_converges_with_the_default_budget(dtype):
-    """At rest the first residual is rounding; a ratio to it cannot be met, and should not be asked for."""
+@pytest.mark.parametrize(("dtype", "status"), [("float32", pbng.Status.PRECISION), ("float64", pbng.Status.CONVERGED)])
+def test_rest_ends_at_once_with_the_default_budget(dtype, status):
+    """At rest the first residual is rounding; a ratio to it cannot be met, and is not asked for."""
     problem = held_box(pbng.Corotated(E=1e5, nu=0.3))
     result = pbng.solve(problem, pbng.PBNG(dtype=dtype))
-    assert result.status is pbng.Status.CONVERGED
+    assert result.status is status
     assert result.iterations == 0
+
+
+def test_a_load_below_the_rounding_of_float32_is_not_called_converged():
+    """Where float32 cannot tell the state from equilibrium it says so; float64 solves it."""
+    scene = pbng.Scene()
+    body = scene.add(pbng.shapes.box(vertices=3), pbng.Corotated(E=1e5, nu=0.3))
+    scene.pin(body.where(x=0.0))
+    scene.force(body.where(x=1.0), (1e-7, 0, 0))
+    assert pbng.solve(scene).status is pbng.Status.PRECISION
+    exact = pbng.solve(scene, DOUBLE)
+    assert exact.status is pbng.Status.CONVERGED
+    assert exact.reduction <= 1e-3
+
+
+def test_far_from_the_origin():
+    """A scene is as accurate a kilometre away: positions are kept relative to its middle."""
+    found = []
+    for away in (0.0, 1000.0):
+        scene = pbng.Scene(gravity=(0.0, -9.8, 0.0))
+        body = scene.add(pbng.shapes.box(vertices=4), pbng.Corotated(E=1e4, nu=0.3), at=(away, 0, 0))
+        scene.pin(body.where(x=away))
+        found.append(pbng.solve(scene).x - (away, 0, 0))
+    np.testing.assert_allclose(found[1], found[0], atol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

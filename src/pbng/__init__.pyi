@@ -9,6 +9,7 @@ from .io.meshes import read_mesh as read_mesh, read_surface as read_surface
 from .materials.base import Block as Block, Material as Material, material as material
 from .materials.check import check_material as check_material
 from .materials.corotated import Corotated as Corotated
+from .materials.invariants import InvariantMaterial as InvariantMaterial
 from .materials.linear import LinearElastic as LinearElastic
 from .materials.neo_hookean import NeoHookean as NeoHookean
 from .materials.stable_neo_hookean import StableNeoHookean as StableNeoHookean

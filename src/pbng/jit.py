@@ -60,12 +60,7 @@ def _feed(digest: Any, value: Any, seen: set[int]) -> None:
         _feed(digest, value.__code__, seen)
         names = sorted(_names(value.__code__))
         for name in names:
-            found = value.__globals__.get(name)
-            if isinstance(found, types.ModuleType) and found.__name__.partition(".")[0] not in _FOREIGN:
-                for attribute in names:
-                    _feed(digest, getattr(found, attribute, None), seen)
-            else:
-                _feed(digest, found, seen)
+            _feed_named(digest, value.__globals__.get(name), names, seen)
         for cell in value.__closure__ or ():
             _feed(digest, cell.cell_contents, seen)
     elif isinstance(value, types.CodeType):
@@ -81,6 +76,16 @@ def _feed(digest: Any, value: Any, seen: set[int]) -> None:
     elif isinstance(value, bool | int | np.generic | float | complex | str | bytes | type(None) | frozenset):
         digest.update(repr(sorted(value, key=repr) if isinstance(value, frozenset) else value).encode())
     # Classes are named by the code that uses them.
+
+
+def _feed_named(digest: Any, value: Any, names: list[str], seen: set[int]) -> None:
+    """Feed a value, or of a module whatever the code may mean by ``module.name``."""
+    if not isinstance(value, types.ModuleType):
+        _feed(digest, value, seen)
+    elif value.__name__.partition(".")[0] not in _FOREIGN and id(value) not in seen:
+        seen.add(id(value))
+        for name in names:
+            _feed_named(digest, getattr(value, name, None), names, seen)
 
 
 @cache

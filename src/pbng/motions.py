@@ -79,6 +79,8 @@ class Rotate(Affine):
         if not np.linalg.norm(axis) > 0:
             raise InputError("Rotate: the axis has no direction")
         object.__setattr__(self, "axis", tuple(axis / np.linalg.norm(axis)))
+        if self.center is not None:
+            object.__setattr__(self, "center", _vector("Rotate: center", self.center))
         if not math.isfinite(self.turns):
             raise InputError(f"Rotate: turns must be finite, not {self.turns}")
 
@@ -99,8 +101,10 @@ class Scale(Affine):
     center: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        factors = (self.by,) * 3 if isinstance(self.by, int | float) else self.by
+        factors = (float(self.by),) * 3 if np.isscalar(self.by) else self.by  # type: ignore[arg-type]
         object.__setattr__(self, "by", _vector("Scale", factors))
+        if self.center is not None:
+            object.__setattr__(self, "center", _vector("Scale: center", self.center))
 
     def linear(self, s: float) -> np.ndarray:
         return np.diag(1 + s * (np.asarray(self.by) - 1))

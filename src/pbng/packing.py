@@ -27,6 +27,7 @@ class Packed:
 
     Attributes:
         slot: New number of each vertex, (n_vert,).
+        origin: What positions are stored relative to [m], (3,): zero but for scenes far from the origin.
         n_slot, n_block: Vertices and padding in all; blocks of W of them that are free.
         color_start: First block of each colour, (n_color + 1,).
         seg_start: First segment of each block, (n_block + 1,).
@@ -37,6 +38,7 @@ class Packed:
     """
 
     slot: np.ndarray
+    origin: np.ndarray
     n_slot: int
     n_block: int
     color_start: np.ndarray
@@ -73,12 +75,13 @@ class Packed:
         """Positions (n_vert, 3) as the flat array (4 n_slot,) that kernels read."""
         out = aligned(4 * self.n_slot, self.dtype)
         out[:] = 0
-        out.reshape(-1, 4)[self.slot, :3] = x
+        out.reshape(-1, 4)[self.slot, :3] = x - self.origin if self.origin.any() else x
         return out
 
     def unpack(self, x: np.ndarray) -> np.ndarray:
-        """Positions (n_vert, 3) of a flat array."""
-        return x.reshape(-1, 4)[self.slot, :3]
+        """Positions (n_vert, 3) of a flat array, in float64 where the origin is not zero."""
+        found = x.reshape(-1, 4)[self.slot, :3]
+        return found + self.origin if self.origin.any() else found
 
 
 def aligned(n: int, dtype) -> np.ndarray:
@@ -140,9 +143,16 @@ def pack_problem(problem: Problem, dtype=np.float32, paper_block: bool = False) 
     seg_start, seg = spans[0] if len(spans) == 1 else _merge(spans)
     seg = seg[:, :5].copy()
     return Packed(
-        slot, len(node) + len(rest), n_block, color_start, seg_start, seg, idx, coef,
+        slot, _origin(problem.X), len(node) + len(rest), n_block, color_start, seg_start, seg, idx, coef,
         _padded(nodal, real).astype(dtype).ravel(), parameters, terms,
     )  # fmt: skip
+
+
+def _origin(X: np.ndarray) -> np.ndarray:
+    """The middle of a scene that lies far away, where float32 positions would lose too many digits, else zero."""
+    low, high = X.min(0), X.max(0)
+    far = np.abs(X).max() > 4 * (high - low).max()
+    return (low + high) / 2 if far else np.zeros(3)
 
 
 def _numbering(problem: Problem) -> tuple[np.ndarray, np.ndarray]:

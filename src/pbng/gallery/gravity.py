@@ -59,7 +59,7 @@ def bent_surface(surface: str | os.PathLike[str] | TriMesh | None = None, resolu
     scene = Scene(gravity=(0.0, -GRAVITY, 0.0), name="bent_surface")
     body = scene.add(mesh, Corotated(E=E, nu=0.3, density=DENSITY), "body")
     clamp = body.where(along >= along.max() - HELD * np.ptp(along))
-    for start, over, turns in ((0.0, 0.6, -0.12), (0.6, 1.2, 0.24), (1.8, 0.6, -0.12)):
+    for start, over, turns in ((0.0, 0.5, -0.12), (0.5, 1.0, 0.24), (1.5, 0.5, -0.12)):
         scene.move(clamp, Eased(Rotate("x", turns)), over=over, start=start)
     return _recipe(scene, DENSITY * mesh.volume.sum())
 

@@ -1,7 +1,11 @@
 """Fixed corotated elasticity, Eq. (7) (Stomakhin et al. 2012)."""
 
+import logging
+
 from pbng.linalg import cofactor, det, mat_combine, mat_sub, norm2, polar, rotation
 from pbng.materials.base import Block, Material, material
+
+log = logging.getLogger("pbng")
 
 
 @material
@@ -20,6 +24,13 @@ class Corotated(Material):
     def stress(F, mu, lam):
         real = type(mu)
         return mat_combine(real(2) * mu, mat_sub(F, rotation(F)), lam * (det(F) - real(1)), cofactor(F))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nu < 0:
+            log.warning(
+                "Corotated with nu = %g < 0: λ < 0, and the energy has no lower bound at large stretch", self.nu
+            )
 
     def block(self) -> Block:
         """a = 2μ, b = λ: |F - R(F)|² <= |F - R₀|², and J is affine in one node's position."""

@@ -65,7 +65,7 @@ class Status(enum.Enum):
     CONVERGED = "The residual met the tolerance."
     ITERATIONS = "The iterations of the budget were used up."
     SECONDS = "The time of the budget was used up."
-    PRECISION = "The residual reached the rounding floor of float32; ask for dtype='float64' to go below it."
+    PRECISION = "The residual reached the floor that rounding the positions leaves; float64 goes below that of float32."
     DIVERGED = "The state is not finite."
     INTERRUPTED = "Interrupted; the state is the last one computed."
 
@@ -182,8 +182,8 @@ class Method(Protocol):
     def certify(self) -> Certificate:
         """The present state in float64."""
 
-    def floor(self) -> float:
-        """The residual [N] that rounding the positions to the method's precision may leave."""
+    def floor(self, dtype: Any = None) -> float:
+        """The residual [N] that rounding the positions to a precision, by default the method's, may leave."""
 
 
 class Solver(Protocol):

@@ -26,8 +26,8 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
     certify(0)
     first, floor = history.last.residual, method.floor()
     tolerance = budget.tolerance(first)
-    if budget.rtol is not None and first <= floor:
-        tolerance = max(tolerance, floor)  # at rest already: a fraction of rounding cannot be asked for
+    if budget.rtol is not None:
+        tolerance = max(tolerance, method.floor(np.float64))  # a fraction of rounding cannot be asked for
     status = _verdict(history, tolerance, floor)
     iteration, correction = 0, 0.0
     try:
@@ -78,6 +78,8 @@ def _verdict(history: History, tolerance: float, floor: float) -> Status | None:
         return Status.CONVERGED
     # Rounding is what is left once the residual is near its floor and has stopped falling.
     recent, before = history.residuals[-3:], history.residuals[:-3]
+    if not before and residual <= floor and len(history.residuals) == 1:
+        return Status.PRECISION
     if before and residual < 4 * floor and min(recent) > 0.9 * min(before):
         return Status.PRECISION
     return None

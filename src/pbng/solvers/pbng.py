@@ -74,7 +74,8 @@ class PackedMethod:
         start = time.perf_counter() - compile_seconds()
         with self.threads.used():
             self.packed = pack_problem(problem, np.dtype(solver.dtype), solver.block == "paper")
-            self.blocks = ElementBlocks(problem.groups, problem.X, self.packed.slot, self.packed.n_slot)
+            X = problem.X - self.packed.origin
+            self.blocks = ElementBlocks(problem.groups, X, self.packed.slot, self.packed.n_slot)
         forward = np.arange(len(self.packed.color_start) - 1)
         self.colors = np.concatenate([forward, forward[::-1]]) if solver.symmetric else forward
         self.n_free = self.packed.n_free
@@ -117,9 +118,9 @@ class PackedMethod:
             energy = found.energy - self._work(self.x)
         return Certificate(float(np.linalg.norm(total)), energy, found.force_scale, found.inverted)
 
-    def floor(self) -> float:
+    def floor(self, dtype: Any = None) -> float:
         """Norm of the forces that moving each node by half a unit in the last place of the largest position makes."""
-        unit = 0.5 * np.finfo(self.x.dtype).eps * float(np.abs(self.x).max(initial=0.0))
+        unit = 0.5 * np.finfo(dtype or self.x.dtype).eps * float(np.abs(self.x).max(initial=0.0))
         return unit * float(np.linalg.norm(self.packed.stiffness()))
 
     def _work(self, x: np.ndarray) -> float:
