@@ -11,7 +11,7 @@ from numba import njit, prange, uint64
 from pbng.coloring import morton
 from pbng.dispatch import call, specialised
 from pbng.elements.base import W
-from pbng.jit import FLAGS, kernel, serial
+from pbng.jit import FLAGS, exact, serial
 
 CHUNK = 64  # blocks a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
 
@@ -143,7 +143,7 @@ def _places(blocks, idx, n_slot):
     return start, place
 
 
-@kernel
+@exact
 def _gather(start, place, buffer, f):
     n = start.size - 1
     for chunk in prange((n + 1023) // 1024):

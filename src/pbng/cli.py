@@ -3,7 +3,6 @@
 What is heavy is imported inside the commands, so that ``pbng --help`` answers at once.
 """
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -43,9 +42,6 @@ def main(
     ] = False,
 ) -> None:
     """Equilibria of soft bodies by position-based nonlinear Gauss-Seidel."""
-    # OpenMP threads wait by spinning, by default for so long that on a busy machine they take the cores from those they
-    # wait for: seen to make a sweep five times slower.
-    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     show_log(debug)
 
 

@@ -9,6 +9,8 @@ type at compile time, so that :func:`pbng.dispatch.call` can find the functions 
 
 import hashlib
 import logging
+import os
+import sys
 import time
 import types
 from collections.abc import Callable
@@ -22,6 +24,13 @@ from numba.core import event
 
 log = logging.getLogger("pbng")
 
+# Numba stores this name for functions made in no module, and imports it when it loads a cached kernel.
+sys.modules.setdefault("<dynamic>", types.ModuleType("<dynamic>"))
+
+# GNU OpenMP spins for long at the barrier behind every colour; on a core that other work wants, that costs a slice of
+# the scheduler each time. It reads this when the first parallel kernel runs.
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+
 # Reassociation and contraction let LLVM vectorise sums; NaN and infinity keep their meaning (no "nnan", "ninf").
 FLAGS: dict[str, Any] = {
     "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
@@ -34,6 +43,7 @@ inline = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, 
 leaf = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, cache=True, **FLAGS)
 function = njit(forceinline=True, **FLAGS)  # an inlined helper that Python can call too
 kernel = njit(parallel=True, cache=True, **FLAGS)  # a module-level parallel loop, cached on disk
+exact = njit(parallel=True, cache=True, error_model="numpy")  # the same, sums in the order that is written
 serial = njit(cache=True, error_model="numpy")  # a module-level serial loop, cached on disk
 
 
@@ -55,7 +65,9 @@ def _feed(digest: Any, value: Any, seen: set[int]) -> None:
         if id(value) in seen or (value.__module__ or "").partition(".")[0] in _FOREIGN:
             return
         seen.add(id(value))
-        if value.__module__.partition(".")[0] == "pbng":  # its file may hold overloads, which no byte code refers to
+        module = value.__module__ or ""
+        digest.update(module.encode())  # Numba imports the module that a cached kernel came from
+        if module.partition(".")[0] == "pbng":  # its file may hold overloads, which no byte code refers to
             digest.update(_file_hash(value.__code__.co_filename))
         _feed(digest, value.__code__, seen)
         names = sorted(_names(value.__code__))

@@ -16,8 +16,9 @@ ACCELERATIONS: dict[str, Any] = {
     "node SOR 1.9": NodeSOR(1.9),
     "SOR as printed": SOR(),
     "Chebyshev as printed": Chebyshev(),
-    "Anderson(5)": Anderson(5),
-    "Anderson(10)": Anderson(10),
+    "Anderson(5), ω = 1": Anderson(5, 1.0),
+    "Anderson(10), ω = 1": Anderson(10, 1.0),
+    "Anderson(10), ω = 1.3": Anderson(10, 1.3),
 }
 LEVELS = (1e-2, 1e-3, 1e-4, 1e-6)
 

@@ -15,9 +15,7 @@ from pbng.meshing import creature, tetrahedralize
 from pbng.motions import Rotate
 from pbng.scene import Scene
 from pbng.shapes import beam
-from pbng.solvers.acceleration import Anderson
 from pbng.solvers.base import Budget
-from pbng.solvers.pbng import PBNG
 
 GRAVITY = 9.8  # m/s²
 DENSITY = 1000.0  # kg/m³ of bodies from files
@@ -114,7 +112,6 @@ def _filled(surface: str | os.PathLike[str] | TriMesh | None, resolution: int) -
 
 
 def _recipe(scene: Scene, mass: float) -> Recipe:
-    # Over-relaxed sweeps carry a load along a slender body in about half as many iterations. A frame is done when what
-    # is out of balance is a thousandth of the weight; where a body snaps from one side to another, the cap ends it.
-    solver = PBNG(acceleration=Anderson(omega=1.7))
-    return Recipe(scene, solver=solver, budget=Budget(atol=1e-3 * GRAVITY * float(mass), iterations=1000))
+    # A frame is done when what is out of balance is a thousandth of the weight; where a body snaps from one side to
+    # another, the cap ends it.
+    return Recipe(scene, budget=Budget(atol=1e-3 * GRAVITY * float(mass), iterations=1000))

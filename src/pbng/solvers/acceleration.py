@@ -133,11 +133,12 @@ class Anderson:
 
     With f_k = G(x_k) - x_k, θ minimises |f_k - ΔF θ| and x_{k+1} = G(x_k) - ΔG θ if that is no higher than x_k, else
     G(x_k), after which the history starts afresh. An energy costs most of a sweep, so once mixing has proved itself it
-    is evaluated every few iterations only; if it has risen, the iteration returns to where it was last known.
+    is evaluated every few iterations only; if it has risen, the iteration returns to where it was last known. The
+    defaults were chosen by measurement (docs/choosing.md).
     """
 
     memory: int = 10
-    omega: float = 1.0
+    omega: float = 1.3
 
     def __post_init__(self) -> None:
         if not (isinstance(self.memory, int) and self.memory >= 1):

@@ -42,7 +42,7 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
                 method.step()
                 iteration += 1
                 if before is not None:
-                    correction = float(np.abs(method.state() - before).max(initial=0.0))
+                    correction = float(np.linalg.norm(method.state() - before, axis=1).max(initial=0.0))
                 if due:
                     certify(iteration)
                     status = _verdict(history, tolerance, floor)
