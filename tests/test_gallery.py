@@ -12,7 +12,7 @@ from pbng.gallery import SCENES, find, gravity
 from pbng.gallery.motion import Eased
 from pbng.gallery.recipe import Recipe
 
-TINY = {"resolutions": 8, "hanging_bar": 3, "bent_surface": 10}
+TINY = {"resolutions": 8, "hanging_bar": 3, "bent_surface": 12}
 
 
 @pytest.mark.parametrize("name", SCENES)
