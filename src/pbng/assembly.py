@@ -16,15 +16,6 @@ from pbng.jit import FLAGS, exact, serial
 CHUNK = 64  # blocks a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
 
 
-class Evaluation:
-    """What one pass over the elements finds: ``energy`` [J], ``force_scale`` [N] and ``inverted`` elements."""
-
-    __slots__ = ("energy", "force_scale", "inverted")
-
-    def __init__(self, energy: float, force_scale: float, inverted: int) -> None:
-        self.energy, self.force_scale, self.inverted = energy, force_scale, inverted
-
-
 class ElementBlocks:
     """Element groups laid out for evaluation, for any numbering of the vertices.
 
@@ -67,14 +58,17 @@ class ElementBlocks:
         """Elastic energy [J] at x, flat (4 n_slot,) with a zero fourth component, of either precision."""
         return float(self._run(x, np.empty(0), 0)[0])
 
-    def forces(self, x: np.ndarray, f: np.ndarray) -> Evaluation:
-        """Write the internal force of every node [N] to f (4 n_slot,) float64; x as for :meth:`energy`."""
+    def forces(self, x: np.ndarray, f: np.ndarray) -> tuple[float, int]:
+        """Write the internal force of every node [N] to f (4 n_slot,) float64; x as for :meth:`energy`.
+
+        Returns the sum of the norms of all elements' forces [N] and the number of inverted elements.
+        """
         if self._forces is None:
             self._forces = np.empty(3 * len(self.idx))
             self._start, self._place = _places(self.blocks, self.idx, self.n_slot)
-        energy, force_scale, inverted = self._run(x, self._forces, len(self.terms))
+        force_scale, inverted = self._run(x, self._forces, len(self.terms))
         _gather(self._start, self._place, self._forces, f)
-        return Evaluation(float(energy), float(force_scale), int(inverted))
+        return float(force_scale), int(inverted)
 
     def _run(self, x: np.ndarray, f: np.ndarray, shift: int) -> np.ndarray:
         functions = [t.kind.energy(t.model) for t in self.terms] + [t.kind.forces(t.model) for t in self.terms]
@@ -93,25 +87,24 @@ def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarr
 
 
 def make_evaluate(key: str):
-    """Kernel of :class:`ElementBlocks`: energy, force scale and inverted elements of each chunk.
+    """Kernel of :class:`ElementBlocks`: the two sums of each chunk.
 
-    ``shift`` is 0 for the energy alone, or the number of terms for the forces as well.
+    ``shift`` is 0 for energy, or the number of terms for forces.
     """
 
     @njit(parallel=True, cache=True, **FLAGS)
     def evaluate(x, X, blocks, idx, par, shift, f):
         n = blocks.shape[0]
-        part = np.zeros(((n + CHUNK - 1) // CHUNK, 3))
+        part = np.zeros(((n + CHUNK - 1) // CHUNK, 2))
         for chunk in prange(part.shape[0]):
             gx, gX = np.empty(16 * W, x.dtype), np.empty(16 * W)
-            out = np.empty(15 * W)
+            out = np.empty(14 * W)
             for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
                 k, p, first, m = blocks[b]
                 i = uint64(first)
-                e, s, inverted = call(key, k + shift, (m, i, x, X, idx, par, uint64(p), gx, gX, out, f, uint64(3) * i))
-                part[chunk, 0] += e
-                part[chunk, 1] += s
-                part[chunk, 2] += inverted
+                total, inverted = call(key, k + shift, (m, i, x, X, idx, par, uint64(p), gx, gX, out, f, uint64(3) * i))
+                part[chunk, 0] += total
+                part[chunk, 1] += inverted
         return part
 
     return evaluate

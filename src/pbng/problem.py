@@ -95,7 +95,7 @@ class Problem:
 
     def inverted(self, x: np.ndarray) -> int:
         """Number of elements with det F < 0."""
-        return self._blocks.forces(self._flat(x), np.empty(4 * self.n_vert)).inverted
+        return self._blocks.forces(self._flat(x), np.empty(4 * self.n_vert))[1]
 
     def constrain(self, x: np.ndarray, t: float) -> np.ndarray:
         """A copy of x (n_vert, 3) with the prescribed vertices where they belong at time t [s]."""

@@ -23,7 +23,7 @@ NODE_FRAME, REST_FRAME = 7, 10  # coefficients of an incidence
 zero = uint64(0)
 _1, _2, _3, _4, _5, _6 = (uint64(W * j) for j in range(1, 7))
 _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(7, 12))
-_12, _13, _14 = (uint64(W * j) for j in range(12, 15))
+_12, _13 = uint64(12 * W), uint64(13 * W)
 _Q, _R, _S = (uint64(4 * W * j) for j in range(1, 4))  # second, third, fourth vertex in the scratch array
 
 
@@ -231,13 +231,13 @@ class Simplex(ElementKind):
             total = 0.0
             for l_ in range(m):
                 total += out[uint64(l_)]
-            return total, 0.0, 0
+            return total, 0
 
         return energy
 
     @cache
     def forces(self, model: Model) -> Any:
-        corners, element, psi, stress, plane = self.corners, self._element(), model.energy, model.stress, self.plane
+        corners, element, stress, plane = self.corners, self._element(), model.stress, self.plane
         numbers = parameters(model.n_parameters)
         last = _6 if plane else _9  # where the force on the last corner goes
 
@@ -261,19 +261,17 @@ class Simplex(ElementKind):
                     out[_6 + l], out[_7 + l], out[_8 + l] = fb
                     norm2 += dot(fb, fb)
                 out[last + l], out[last + _1 + l], out[last + _2 + l] = fe
-                out[_12 + l] = V * psi(F, *number)
-                out[_13 + l] = math.sqrt(norm2)
-                out[_14 + l] = det(F)
+                out[_12 + l] = math.sqrt(norm2)
+                out[_13 + l] = det(F)
             for l_ in range(3 * corners * W):
                 l = uint64(l_)
                 f[o + l] = out[l]
-            total, size, inverted = 0.0, 0.0, 0
+            size, inverted = 0.0, 0
             for l_ in range(m):
                 l = uint64(l_)
-                total += out[_12 + l]
-                size += out[_13 + l]
-                inverted += out[_14 + l] < 0.0
-            return total, size, inverted
+                size += out[_12 + l]
+                inverted += out[_13 + l] < 0.0
+            return size, inverted
 
         return forces
 

@@ -113,10 +113,9 @@ class PackedMethod:
 
     def certify(self) -> Certificate:
         with self.threads.used():
-            found = self.blocks.forces(self.x, self.forces)
+            force_scale, inverted = self.blocks.forces(self.x, self.forces)
             total = self.forces[: self.n_free] + self.f_ext[: self.n_free]
-            energy = found.energy - self._work(self.x)
-        return Certificate(float(np.linalg.norm(total)), energy, found.force_scale, found.inverted)
+            return Certificate(float(np.linalg.norm(total)), self.energy(self.x), force_scale, inverted)
 
     def floor(self, dtype: Any = None) -> float:
         """Norm of the forces that moving each node by half a unit in the last place of the largest position makes."""

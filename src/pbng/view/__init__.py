@@ -1,8 +1,11 @@
 """Looking at runs: pictures, films, strips and plots. Needs ``pbng[view]``, imported only when something is drawn."""
 
 import sys
+from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+from pbng.errors import InputError
 
 if TYPE_CHECKING:
     from pbng.view.plots import plot_residuals
@@ -11,12 +14,20 @@ if TYPE_CHECKING:
 __all__ = ["film", "picture", "plot_residuals", "sheet", "view"]
 
 
+def _need(*packages: str) -> None:
+    missing = [p for p in packages if find_spec(p) is None]
+    if missing:
+        raise InputError(f"pictures need {' and '.join(missing)}: pip install 'pbng[view]'")
+
+
 def __getattr__(name: str) -> Any:
     if name == "plot_residuals":
+        _need("matplotlib")
         from pbng.view import plots
 
         return plots.plot_residuals
     if name in __all__:
+        _need("pyvista", "matplotlib")
         from pbng.view import render
 
         return getattr(render, name)

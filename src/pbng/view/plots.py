@@ -80,12 +80,12 @@ def color_bar(size: tuple[int, int], low: float, high: float, cmap: Any, label: 
 
     ``unit`` is the size [pixels] of what is one pixel in a picture 720 high.
     """
+    width, height = size
+    figure = _page(size)
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
 
-    width, height = size
-    figure = _page(size)
     tall = min(0.5 * height, 300 * unit)
     box = ((width - 88 * unit) / width, (height - tall) / 2 / height, 11 * unit / width, tall / height)
     bar = figure.colorbar(ScalarMappable(Normalize(low, high), cmap), cax=figure.add_axes(box))
@@ -159,11 +159,7 @@ def _apart(wanted: np.ndarray, gap: float) -> np.ndarray:
 
 
 def _paper(size: tuple[float, float]) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
@@ -180,10 +176,15 @@ def _paper(size: tuple[float, float]) -> tuple[Any, Any]:
 
 
 def _page(size: tuple[int, int]) -> Any:
+    return _figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="none")
+
+
+def _figure(**options: Any) -> Any:
+    """A figure on a canvas in memory, which needs no window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, facecolor="none")
+    figure = Figure(**options)
     FigureCanvasAgg(figure)
     return figure
 
