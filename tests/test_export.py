@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from runs import box, frames, sheet
+from fake_runs import box, frames, sheet
 
 from pbng.errors import InputError
 from pbng.io.export import FORMATS, drawn, export

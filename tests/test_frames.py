@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from runs import Body, Problem, Status, box, frames, sheet
+from fake_runs import Body, Problem, Status, box, frames, sheet
 
 from pbng.errors import InputError
 from pbng.io import store
@@ -89,7 +89,7 @@ def test_info_is_kept(tmp_path):
 CHILD = """
 import sys
 sys.path[:0] = {paths!r}
-from runs import box, frames
+from fake_runs import box, frames
 from pbng.io.frames import FrameWriter
 with FrameWriter({run!r}, overwrite=True) as out:
     for frame in frames([box((12, 12, 12))], 100000):

@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from runs import box, frames, sheet, twisted
+from fake_runs import box, frames, sheet, twisted
 
 from pbng.errors import InputError
 from pbng.io.frames import FrameWriter, Run
