@@ -23,7 +23,7 @@ class Budget:
         seconds: At most so many seconds [s], set-up and compilation excluded.
         rtol: Stop when the residual has fallen to this fraction of the first one.
         atol: Stop when the residual norm is below this [N].
-        every: Evaluate the residual every so many iterations; it costs about two sweeps.
+        every: Evaluate the residual every so many iterations; it costs as much as several sweeps.
     """
 
     iterations: int | None = None
