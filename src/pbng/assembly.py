@@ -1,9 +1,11 @@
 """Energy and forces of all elements in float64: the certificate every method shares.
 
 Elements are laid out in blocks of W of one group (lanes, see :mod:`pbng.elements.base`). Shape gradients are recomputed
-from the rest positions, which costs less than to read them. Forces go to a buffer, a place a corner, from which each
-node then sums its own: no atomics, and the same bits for any number of threads.
+from the rest positions, which costs less than to read them. Forces are added to the nodes chunk by chunk, chunks that
+share no node in parallel: no atomics, and the same bits for any number of threads.
 """
+
+from functools import cached_property
 
 import numpy as np
 from numba import njit, prange, uint64
@@ -11,9 +13,9 @@ from numba import njit, prange, uint64
 from pbng.coloring import morton
 from pbng.dispatch import call, specialised
 from pbng.elements.base import W
-from pbng.jit import FLAGS, exact, serial
+from pbng.jit import FLAGS, serial
 
-CHUNK = 64  # blocks a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
+CHUNK = 32  # blocks a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
 
 
 class ElementBlocks:
@@ -51,29 +53,33 @@ class ElementBlocks:
             blocks.append(rows)
             at += n_block * W * corners
         self.idx, self.blocks = np.concatenate(idx), np.concatenate(blocks)
-        self._forces: np.ndarray | None = None
-        self._start = self._place = np.empty(0, np.int64)
+        self._all = np.arange(-(-len(self.blocks) // CHUNK))
 
     def energy(self, x: np.ndarray) -> float:
         """Elastic energy [J] at x, flat (4 n_slot,) with a zero fourth component, of either precision."""
-        return float(self._run(x, np.empty(0), 0)[0])
+        once = np.array([0, len(self._all)])
+        return float(self._run(x, np.empty(0), 0, self._all, once)[0])
 
     def forces(self, x: np.ndarray, f: np.ndarray) -> tuple[float, int]:
         """Write the internal force of every node [N] to f (4 n_slot,) float64; x as for :meth:`energy`.
 
         Returns the sum of the norms of all elements' forces [N] and the number of inverted elements.
         """
-        if self._forces is None:
-            self._forces = np.empty(3 * len(self.idx))
-            self._start, self._place = _places(self.blocks, self.idx, self.n_slot)
-        force_scale, inverted = self._run(x, self._forces, len(self.terms))
-        _gather(self._start, self._place, self._forces, f)
+        f[:] = 0.0
+        force_scale, inverted = self._run(x, f, len(self.terms), *self._disjoint)
         return float(force_scale), int(inverted)
 
-    def _run(self, x: np.ndarray, f: np.ndarray, shift: int) -> np.ndarray:
+    @cached_property
+    def _disjoint(self) -> tuple[np.ndarray, np.ndarray]:
+        """The chunks in an order, and where in it each set of chunks that share no node starts."""
+        color = np.empty(len(self._all), np.int64)
+        _color_chunks(self.blocks, self.idx, np.zeros(self.n_slot, np.uint64), color)
+        return np.argsort(color, kind="stable"), np.cumsum(np.bincount(color + 1))
+
+    def _run(self, x: np.ndarray, f: np.ndarray, shift: int, order: np.ndarray, start: np.ndarray) -> np.ndarray:
         functions = [t.kind.energy(t.model) for t in self.terms] + [t.kind.forces(t.model) for t in self.terms]
         run = specialised(make_evaluate, tuple(functions))
-        return run(x, self.X, self.blocks, self.idx, self.parameters, shift, f).sum(0)
+        return run(x, self.X, self.blocks, self.idx, self.parameters, shift, f, order, start).sum(0)
 
 
 def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -89,65 +95,47 @@ def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarr
 def make_evaluate(key: str):
     """Kernel of :class:`ElementBlocks`: the two sums of each chunk.
 
-    ``shift`` is 0 for energy, or the number of terms for forces.
+    ``shift`` is 0 for energy, or the number of terms for forces; chunks are taken in the given order, those between
+    two of ``start`` in parallel.
     """
 
     @njit(parallel=True, cache=True, **FLAGS)
-    def evaluate(x, X, blocks, idx, par, shift, f):
+    def evaluate(x, X, blocks, idx, par, shift, f, order, start):
         n = blocks.shape[0]
-        part = np.zeros(((n + CHUNK - 1) // CHUNK, 2))
-        for chunk in prange(part.shape[0]):
-            gx, gX = np.empty(16 * W, x.dtype), np.empty(16 * W)
-            out = np.empty(14 * W)
-            for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-                k, p, first, m = blocks[b]
-                i = uint64(first)
-                total, inverted = call(key, k + shift, (m, i, x, X, idx, par, uint64(p), gx, gX, out, f, uint64(3) * i))
-                part[chunk, 0] += total
-                part[chunk, 1] += inverted
+        part = np.zeros((order.size, 2))
+        for s in range(start.size - 1):
+            for turn in prange(start[s], start[s + 1]):
+                chunk = order[turn]
+                gx, gX = np.empty(16 * W, x.dtype), np.empty(16 * W)
+                out = np.empty(14 * W)
+                for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+                    k, p, first, m = blocks[b]
+                    arguments = m, uint64(first), x, X, idx, par, uint64(p), gx, gX, out, f
+                    total, inverted = call(key, k + shift, arguments)
+                    part[chunk, 0] += total
+                    part[chunk, 1] += inverted
         return part
 
     return evaluate
 
 
 @serial
-def _places(blocks, idx, n_slot):
-    """Where in the force buffer the corners of each vertex are, in compressed rows (real elements only)."""
-    start = np.zeros(n_slot + 1, np.int64)
-    for b in range(blocks.shape[0]):
-        first, m = blocks[b, 2], blocks[b, 3]
-        end = blocks[b + 1, 2] if b + 1 < blocks.shape[0] else idx.size
-        for i in range(first, end):
-            if (i - first) % W < m:
-                start[idx[i] // 4 + 1] += 1
-    for v in range(n_slot):
-        start[v + 1] += start[v]
-    position = start[:-1].copy()
-    place = np.empty(start[-1], np.int64)
-    for b in range(blocks.shape[0]):
-        first, m = blocks[b, 2], blocks[b, 3]
-        end = blocks[b + 1, 2] if b + 1 < blocks.shape[0] else idx.size
-        for i in range(first, end):
-            lane = (i - first) % W
-            if lane < m:
-                v = idx[i] // 4
-                place[position[v]] = 3 * first + (i - first) // W * (3 * W) + lane
-                position[v] += 1
-    return start, place
-
-
-@exact
-def _gather(start, place, buffer, f):
-    n = start.size - 1
-    for chunk in prange((n + 1023) // 1024):
-        for v in range(chunk * 1024, min(n, (chunk + 1) * 1024)):
-            a, b, c = 0.0, 0.0, 0.0
-            for k in range(start[v], start[v + 1]):
-                o = place[k]
-                a += buffer[o]
-                b += buffer[o + W]
-                c += buffer[o + 2 * W]
-            f[4 * v] = a
-            f[4 * v + 1] = b
-            f[4 * v + 2] = c
-            f[4 * v + 3] = 0.0
+def _color_chunks(blocks, idx, used, color):
+    """Colour chunks greedily; ``used`` holds, for each node, the colours of the chunks that it is in, as bits."""
+    one, base, highest = np.uint64(1), 0, 0
+    for chunk in range(color.size):
+        last = min((chunk + 1) * CHUNK, blocks.shape[0])
+        end = blocks[last, 2] if last < blocks.shape[0] else idx.size
+        taken = np.uint64(0)
+        for i in range(blocks[chunk * CHUNK, 2], end):
+            taken |= used[idx[i] // 4]
+        c = 0
+        while c < 64 and (taken >> np.uint64(c)) & one:
+            c += 1
+        if c == 64:  # a node in very many chunks: begin a new set of colours
+            used[:] = 0
+            base, c = highest + 1, 0
+        color[chunk] = base + c
+        highest = max(highest, base + c)
+        for i in range(blocks[chunk * CHUNK, 2], end):
+            used[idx[i] // 4] |= one << np.uint64(c)

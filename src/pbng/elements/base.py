@@ -50,12 +50,12 @@ class ElementKind(ABC):
 
     @abstractmethod
     def energy(self, model: Model) -> Any:
-        """``(m, i, x, X, idx, par, p, gx, gX, out, f, o) -> (energy [J], 0)`` of the first m of the W elements at
-        ``idx[i]``; gx, gX and out are scratch, the last two arguments are not used."""
+        """``(m, i, x, X, idx, par, p, gx, gX, out, f) -> (energy [J], 0)`` of the first m of the W elements at
+        ``idx[i]``; gx, gX and out are scratch, f is not used."""
 
     @abstractmethod
     def forces(self, model: Model) -> Any:
-        """The same, with the forces on the elements' corners written to ``f[o]``; returns the sum of the norms of the
+        """The same, with the forces on the elements' corners added to f; returns the sum of the norms of the
         elements' forces [N] and the number of inverted elements."""
 
 

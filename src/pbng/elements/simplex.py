@@ -220,7 +220,7 @@ class Simplex(ElementKind):
         numbers = parameters(model.n_parameters)
 
         @inline
-        def energy(m, i, x, X, idx, par, p, gx, gX, out, f, o):
+        def energy(m, i, x, X, idx, par, p, gx, gX, out, f):
             number = numbers(par, p + uint64(1))
             gather(corners, i, x, idx, gx, zero)
             gather(corners, i, X, idx, gX, zero)
@@ -242,7 +242,7 @@ class Simplex(ElementKind):
         last = _6 if plane else _9  # where the force on the last corner goes
 
         @inline
-        def forces(m, i, x, X, idx, par, p, gx, gX, out, f, o):
+        def forces(m, i, x, X, idx, par, p, gx, gX, out, f):
             number = numbers(par, p + uint64(1))
             gather(corners, i, x, idx, gx, zero)
             gather(corners, i, X, idx, gX, zero)
@@ -263,12 +263,14 @@ class Simplex(ElementKind):
                 out[last + l], out[last + _1 + l], out[last + _2 + l] = fe
                 out[_12 + l] = math.sqrt(norm2)
                 out[_13 + l] = det(F)
-            for l_ in range(3 * corners * W):
-                l = uint64(l_)
-                f[o + l] = out[l]
             size, inverted = 0.0, 0
             for l_ in range(m):
                 l = uint64(l_)
+                for a in range(corners):
+                    at, j = uint64(idx[i + uint64(W * a) + l]), uint64(3 * W * a) + l
+                    f[at] += out[j]
+                    f[at + uint64(1)] += out[j + _1]
+                    f[at + uint64(2)] += out[j + _2]
                 size += out[_12 + l]
                 inverted += out[_13 + l] < 0.0
             return size, inverted

@@ -14,7 +14,7 @@ from numba import prange
 from pbng.errors import InputError
 from pbng.jit import kernel
 
-CHUNK = 8192  # entries a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
+CHUNK = 4096  # entries a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
 
 
 class FixedPoint(Protocol):
@@ -238,22 +238,29 @@ class _Mixing:
 
 @kernel
 def _difference(x, g, f_before, g_before, dF, dG, row, kept):
-    """Store the newest differences in ``row``; returns ΔF_row · ΔF_j, then ΔF_j · f, for j < kept, by chunks."""
+    """Store the newest differences in ``row``; returns ΔF_row · ΔF_j, then ΔF_j · f, for j < kept, by chunks.
+
+    Slices, here and below, because Numba's test for negative indices keeps loops over two-index arrays scalar.
+    """
     n = x.size
     part = np.zeros(((n + CHUNK - 1) // CHUNK, 2 * kept))
     for chunk in prange(part.shape[0]):
         low, high = chunk * CHUNK, min(n, (chunk + 1) * CHUNK)
-        for i in range(low, high):
-            f = g[i] - x[i]
-            dF[row, i] = f - f_before[i]  # means nothing on the first call after a restart: it is overwritten
-            dG[row, i] = g[i] - g_before[i]
-            f_before[i] = f
-            g_before[i] = g[i]
+        here, image, f, image_before = x[low:high], g[low:high], f_before[low:high], g_before[low:high]
+        df, dg = dF[row, low:high], dG[row, low:high]  # mean nothing on the first call: they are overwritten
+        for i in range(high - low):
+            step = image[i] - here[i]
+            df[i] = step - f[i]
+            f[i] = step
+        for i in range(high - low):
+            dg[i] = image[i] - image_before[i]
+            image_before[i] = image[i]
         for j in range(kept):
+            other = dF[j, low:high]
             a, b = 0.0, 0.0
-            for i in range(low, high):
-                a += dF[row, i] * dF[j, i]
-                b += dF[j, i] * f_before[i]
+            for i in range(high - low):
+                a += df[i] * other[i]
+                b += other[i] * f[i]
             part[chunk, j] = a
             part[chunk, kept + j] = b
     return part
@@ -265,9 +272,10 @@ def _mix(g, dG, theta, out):
     n = g.size
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         low, high = chunk * CHUNK, min(n, (chunk + 1) * CHUNK)
-        for i in range(low, high):
-            out[i] = g[i]
+        mixed, image = out[low:high], g[low:high]
+        for i in range(high - low):
+            mixed[i] = image[i]
         for j in range(theta.size):
-            t = theta[j]
-            for i in range(low, high):
-                out[i] -= t * dG[j, i]
+            t, dg = theta[j], dG[j, low:high]
+            for i in range(high - low):
+                mixed[i] -= t * dg[i]
