@@ -8,12 +8,13 @@ share no node in parallel: no atomics, and the same bits for any number of threa
 from functools import cached_property
 
 import numpy as np
-from numba import njit, prange, uint64
+from numba import uint64
 
 from pbng.coloring import morton
 from pbng.dispatch import call, specialised
 from pbng.elements.base import W
-from pbng.jit import FLAGS, serial
+from pbng.jit import serial
+from pbng.parallel import array, body, rows, run, scratch
 
 CHUNK = 32  # blocks a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
 
@@ -78,8 +79,12 @@ class ElementBlocks:
 
     def _run(self, x: np.ndarray, f: np.ndarray, shift: int, order: np.ndarray, start: np.ndarray) -> np.ndarray:
         functions = [t.kind.energy(t.model) for t in self.terms] + [t.kind.forces(t.model) for t in self.terms]
-        run = specialised(make_evaluate, tuple(functions))
-        return run(x, self.X, self.blocks, self.idx, self.parameters, shift, f, order, start).sum(0)
+        part = np.empty((len(self._all), 2))
+        sizes = np.array([len(self.blocks), shift])
+        arrays = x, self.X, self.blocks, self.idx, self.parameters, f, order, part, sizes
+        chunks = specialised(make_evaluate, tuple(functions), x.dtype)
+        run(chunks, arrays, np.arange(len(start) - 1), start)
+        return part.sum(0)
 
 
 def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -92,29 +97,32 @@ def group_parameters(groups, dtype, paper_block: bool = False) -> tuple[np.ndarr
     return np.array([v for r in rows for v in r], dtype), first
 
 
-def make_evaluate(key: str):
-    """Kernel of :class:`ElementBlocks`: the two sums of each chunk.
+def make_evaluate(key: str, dtype: np.dtype):
+    """Body of :class:`ElementBlocks`: the two sums of chunks low .. high of the given order.
 
-    ``shift`` is 0 for energy, or the number of terms for forces; chunks are taken in the given order, those between
-    two of ``start`` in parallel.
+    ``shift`` is 0 for energy, or the number of terms for forces.
     """
+    real = dtype.type
+    wide = np.dtype(np.float64)
+    current, at_rest, results = scratch(16 * W, dtype), scratch(16 * W, wide), scratch(14 * W, wide)
 
-    @njit(parallel=True, cache=True, **FLAGS)
-    def evaluate(x, X, blocks, idx, par, shift, f, order, start):
-        n = blocks.shape[0]
-        part = np.zeros((order.size, 2))
-        for s in range(start.size - 1):
-            for turn in prange(start[s], start[s + 1]):
-                chunk = order[turn]
-                gx, gX = np.empty(16 * W, x.dtype), np.empty(16 * W)
-                out = np.empty(14 * W)
-                for b in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-                    k, p, first, m = blocks[b]
-                    arguments = m, uint64(first), x, X, idx, par, uint64(p), gx, gX, out, f
-                    total, inverted = call(key, k + shift, arguments)
-                    part[chunk, 0] += total
-                    part[chunk, 1] += inverted
-        return part
+    @body
+    def evaluate(arguments, low, high):
+        x, X, blocks = array(arguments, 0, real), array(arguments, 1, np.float64), rows(arguments, 2, 4, np.int64)
+        idx, par, f = array(arguments, 3, np.uint32), array(arguments, 4, np.float64), array(arguments, 5, np.float64)
+        order, part = array(arguments, 6, np.int64), rows(arguments, 7, 2, np.float64)
+        n_block, shift = array(arguments, 8, np.int64)[0], array(arguments, 8, np.int64)[1]
+        gx, gX, out = current(), at_rest(), results()
+        for turn in range(low, high):
+            chunk = order[turn]
+            first, second = 0.0, 0.0
+            for b in range(chunk * CHUNK, min(n_block, (chunk + 1) * CHUNK)):
+                k, p, i, m = blocks[b]
+                total, inverted = call(key, k + shift, (m, uint64(i), x, X, idx, par, uint64(p), gx, gX, out, f))
+                first += total
+                second += inverted
+            part[chunk, 0] = first
+            part[chunk, 1] = second
 
     return evaluate
 

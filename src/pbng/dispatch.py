@@ -6,7 +6,7 @@ branch a function in place, and everything is inlined. One kernel thus serves a 
 material costs what a built-in of the same arithmetic costs.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import cache
 from typing import Any
 
@@ -19,11 +19,14 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {}
 
 
 @cache
-def specialised(make: Callable[[str], Any], functions: tuple[Any, ...]) -> Any:
-    """The kernel ``make(key)`` that calls these functions; compiled on first use, then loaded from Numba's cache."""
+def specialised(make: Callable[..., Any], functions: tuple[Any, ...], *further: Hashable) -> Any:
+    """The kernel ``make(key, *further)`` that calls these functions; compiled on first use, then loaded from the cache.
+
+    ``further`` are constants of the kernel, such as the type of real numbers.
+    """
     key = "-".join(fingerprint(f) for f in (make, *functions))
     _FUNCTIONS[key] = functions
-    return make(key)
+    return make(key, *further)
 
 
 def call(key, k, arguments):

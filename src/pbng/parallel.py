@@ -1,0 +1,105 @@
+"""Parallel loops over compiled functions: one driver for all, so that a new function is compiled as serial code only.
+
+Numba spends about as long on a parallel loop as on the code inside it. A *body* is therefore a serial function
+``(arguments, low, high)`` that does the work of a range; the driver, compiled once and cached, calls it by its address.
+Arrays go as addresses too: :func:`array` and :func:`rows` make them arrays again inside the body.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import carray, from_dtype, njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from pbng.jit import FLAGS, inline, kernel
+
+body = njit(cache=True, no_cpython_wrapper=True, **FLAGS)
+_SIGNATURE = types.CPointer(types.intp), types.intp, types.intp
+_ENDLESS = 1 << 40  # lengths are not passed: bodies know how far they may go
+
+
+def run(body: Any, arrays: tuple[np.ndarray, ...], sets: np.ndarray, start: np.ndarray, grain: int = 1) -> None:
+    """Call a body for the ranges ``start[s] .. start[s + 1]`` with s from ``sets`` in turn, each range in parallel.
+
+    Args:
+        body: The compiled function.
+        arrays: What it works on, contiguous and of just the types that it declares: nobody checks.
+        sets, start: Which ranges; nothing may be written that another call of the same range reads or writes.
+        grain: Length of the pieces of a range that are given to threads.
+    """
+    _run(_address(body), np.array([a.__array_interface__["data"][0] for a in arrays]), sets, start, grain)
+
+
+def _address(body: Any) -> int:
+    compiled = body.overloads.get(_SIGNATURE)
+    if compiled is None:
+        body.compile(_SIGNATURE)
+        compiled = body.overloads[_SIGNATURE]
+    return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name))
+
+
+@inline
+def array(arguments, j, dtype):
+    """Argument j of a body as a flat array."""
+    return carray(_pointer(arguments[j]), (_ENDLESS,), dtype)
+
+
+@inline
+def rows(arguments, j, columns, dtype):
+    """Argument j of a body as an array of rows."""
+    return carray(_pointer(arguments[j]), (_ENDLESS, columns), dtype)
+
+
+@cache
+def scratch(n: int, dtype: np.dtype) -> Any:
+    """``() -> array``: n numbers on the stack of a body, at a cache line, not initialised.
+
+    On the stack, LLVM knows that nothing else points there; and asking for a whole line makes it align the stack, where
+    it puts what registers cannot hold, which otherwise straddles lines in some processes and not in others.
+    """
+
+    @intrinsic
+    def allocate(typing):
+        real = from_dtype(dtype)
+
+        def generate(context, builder, signature, values):
+            place = cgutils.alloca_once(builder, ir.ArrayType(context.get_data_type(real), n))
+            place.align = 64
+            return builder.bitcast(place, context.get_value_type(types.CPointer(real)))
+
+        return types.CPointer(real)(), generate
+
+    return inline(lambda: carray(allocate(), (n,)))
+
+
+@intrinsic
+def _pointer(typing, address):
+    def generate(context, builder, signature, values):
+        return builder.inttoptr(values[0], context.get_value_type(types.voidptr))
+
+    return types.voidptr(types.intp), generate
+
+
+@intrinsic
+def _call(typing, function, arguments, low, high):
+    """Call a body at an address; ``arguments`` is the address of the addresses of its arrays."""
+
+    def generate(context, builder, signature, values):
+        word = ir.IntType(context.address_size)
+        pointer = ir.FunctionType(ir.VoidType(), [word, word, word]).as_pointer()
+        builder.call(builder.inttoptr(values[0], pointer), values[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.intp, types.intp, types.intp), generate
+
+
+@kernel
+def _run(function, arguments, sets, start, grain):
+    for n in range(sets.size):
+        low, high = start[sets[n]], start[sets[n] + 1]
+        for piece in prange((high - low + grain - 1) // grain):
+            first = low + piece * grain
+            _call(function, arguments.ctypes.data, first, min(high, first + grain))
