@@ -1,6 +1,8 @@
 """The ``pbng bench`` commands."""
 
 import json
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 app = typer.Typer(help="Measure: time of a sweep, convergence.", no_args_is_help=True)
-console = Console()
+console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 170)  # tables are wide
 
 
 @app.command("sweep")

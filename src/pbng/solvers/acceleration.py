@@ -132,7 +132,7 @@ class Anderson:
     """Anderson mixing of the last ``memory`` sweeps, taken only where it lowers the energy; never diverges.
 
     With f_k = G(x_k) - x_k, θ minimises |f_k - ΔF θ| and x_{k+1} = G(x_k) - ΔG θ if that is no higher than x_k, else
-    G(x_k), after which the history starts afresh. An energy costs about half a sweep, so once mixing has proved itself
+    G(x_k), after which the history starts afresh. An energy costs about a sweep, so once mixing has proved itself
     it is evaluated every few iterations only; if it has risen, the iteration returns to where it was last known. The
     defaults were chosen by measurement (docs/choosing.md).
     """
