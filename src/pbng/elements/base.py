@@ -27,6 +27,7 @@ class ElementKind(ABC):
     corners: ClassVar[int]
     others: ClassVar[int]
     opposite: ClassVar[np.ndarray]  # (corners, others): for each corner, the local numbers of the others, in order
+    across: ClassVar[float] = 0.0  # part of F₃₃ that does not come from the vertices
 
     @property
     def order(self) -> list[int]:
@@ -36,6 +37,14 @@ class ElementKind(ABC):
     @abstractmethod
     def width(self, isotropic: bool) -> int:
         """Coefficients stored for one incidence."""
+
+    @abstractmethod
+    def gradients(self, X: np.ndarray) -> np.ndarray:
+        """Gradients (n, corners, 3) [1/m] of the shape functions of elements X (n, corners, 3) at rest."""
+
+    @abstractmethod
+    def volume(self, X: np.ndarray) -> np.ndarray:
+        """Rest volumes (n,) [m³] of elements X (n, corners, 3)."""
 
     @abstractmethod
     def pack(self, isotropic: bool) -> Any:

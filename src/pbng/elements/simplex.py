@@ -90,6 +90,20 @@ class Simplex(ElementKind):
         """Volume over det [a b e]."""
         return 1 / 2 if self.plane else 1 / 6
 
+    def gradients(self, X: np.ndarray) -> np.ndarray:
+        others = np.linalg.inv(self._rest_edges(X)).transpose(0, 2, 1)[:, : self.others]
+        return np.concatenate([-others.sum(1, keepdims=True), others], axis=1)
+
+    def volume(self, X: np.ndarray) -> np.ndarray:
+        a, b, e = self._rest_edges(X).transpose(1, 2, 0)
+        return self.share * np.abs((np.cross(a, b, axis=0) * e).sum(0))
+
+    def _rest_edges(self, X: np.ndarray) -> np.ndarray:
+        edges = X[:, 1:] - X[:, :1]
+        if self.plane:
+            edges = np.concatenate([edges, np.broadcast_to([[[0.0, 0.0, 1.0]]], (len(X), 1, 3))], axis=1)
+        return edges
+
     @cache
     def _edges(self, load: Any) -> Any:
         """``(g, j, x) -> a, b, e`` from the scratch array at lane position j and the last corner x."""
@@ -295,6 +309,7 @@ class PlaneTriangle(Simplex):
     others = 2
     opposite = np.array([[2, 1], [0, 2], [1, 0]])
     plane = True
+    across = 1.0
 
 
 TET, PLANE_TRIANGLE = Tet(), PlaneTriangle()

@@ -154,25 +154,23 @@ class _Mixing:
     PROBATION, EVERY = 5, 5  # mixed steps in a row that must prove good one by one; then one in so many is checked
 
     def __init__(self, map: FixedPoint, memory: int, omega: float) -> None:
-        self.map, self.memory, self.omega = map, memory, omega
+        self.map, self.omega = map, omega
         self.energy = math.inf  # at the last checked state
         self.unchecked = 0  # steps since
         self.good = 0  # checks passed in a row
         self.rejected = 0
+        self.history = MixingHistory(memory)
         self.buffers: tuple[np.ndarray, ...] = ()
 
     def step(self, x: np.ndarray) -> None:
         n = self.map.n_free
         if not self.buffers:
-            self._allocate(x, n)
+            self.buffers = np.empty_like(x), x.copy(), np.empty_like(x)  # G(x), mixed, last checked
         g, mixed, checked = self.buffers
         g[:] = x
         self.map.apply(g, self.omega)
-        if self._push(x[:n], g[:n]):
-            theta = self._weights()
-            if theta is not None:
-                mixed[:] = g
-                _mix(g[:n], self.dG, theta, mixed[:n])
+        if self.history.push(x[:n], g[:n]):
+            if self.history.mix(g[:n], mixed[:n]):
                 if self.good >= self.PROBATION and self.unchecked + 1 < self.EVERY:
                     x[:] = mixed
                     self.unchecked += 1
@@ -202,17 +200,28 @@ class _Mixing:
         return True
 
     def _restart(self) -> None:
-        self.count, self.good, self.unchecked, self.rejected = -1, 0, 0, self.rejected + 1
+        self.history.restart()
+        self.good, self.unchecked, self.rejected = 0, 0, self.rejected + 1
 
-    def _allocate(self, x: np.ndarray, n: int) -> None:
-        self.buffers = np.empty_like(x), np.empty_like(x), np.empty_like(x)  # G(x), mixed, last checked
-        self.dF, self.dG = np.zeros((self.memory, n), x.dtype), np.zeros((self.memory, n), x.dtype)
-        self.f, self.g = np.zeros(n, x.dtype), np.zeros(n, x.dtype)
-        self.gram, self.rhs = np.zeros((self.memory, self.memory)), np.zeros(self.memory)
+
+class MixingHistory:
+    """The last differences of a fixed-point iteration x -> g = G(x), and the mixture that they suggest."""
+
+    def __init__(self, memory: int) -> None:
+        self.memory = memory
         self.count = -1  # differences stored since the last restart; -1: not even a first f
+        self.gram, self.rhs = np.zeros((memory, memory)), np.zeros(memory)
 
-    def _push(self, x: np.ndarray, g: np.ndarray) -> bool:
+    def restart(self) -> None:
+        """Forget everything."""
+        self.count = -1
+
+    def push(self, x: np.ndarray, g: np.ndarray) -> bool:
         """Take in x and g = G(x); False if there is no difference to mix with yet."""
+        if not hasattr(self, "dF"):
+            n = len(x)
+            self.dF, self.dG = np.zeros((self.memory, n), x.dtype), np.zeros((self.memory, n), x.dtype)
+            self.f, self.g = np.zeros(n, x.dtype), np.zeros(n, x.dtype)
         first = self.count < 0
         row = max(self.count, 0) % self.memory
         self.count += 1
@@ -223,6 +232,13 @@ class _Mixing:
         self.gram[row, :kept] = self.gram[:kept, row] = sums[:kept]
         self.rhs[:kept] = sums[kept : 2 * kept]
         return True
+
+    def mix(self, g: np.ndarray, out: np.ndarray) -> bool:
+        """Write G(x) - ΔG θ to out, with θ the minimiser of |f - ΔF θ|; False if there is none."""
+        theta = self._weights()
+        if theta is not None:
+            _mix(g, self.dG, theta, out)
+        return theta is not None
 
     def _weights(self) -> np.ndarray | None:
         """θ of the least-squares problem, from its scaled normal equations with a tiny ridge; None if it has none."""

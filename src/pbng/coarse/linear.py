@@ -1,0 +1,182 @@
+"""Linear systems on the grids: block matrices in compressed rows, and conjugate gradients with a V-cycle.
+
+Smoothing is block Gauss-Seidel, forwards before the coarser grid and backwards after it, so that the V-cycle is
+symmetric; the coarsest grid is solved by a factorisation.
+"""
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+from numba import prange
+
+from pbng.coarse.grid import Grid
+from pbng.jit import kernel, serial
+
+DENSE = 1300  # unknowns up to which the coarsest matrix is factorised as a dense one
+
+
+class BlockMatrix:
+    """A symmetric matrix of 3x3 blocks, one row of blocks a node, summed from the stiffness of pieces (n_piece, 8)."""
+
+    def __init__(self, node: np.ndarray, n_node: int) -> None:
+        key = (node[:, :, None].astype(np.int64) * n_node + node[:, None, :]).ravel()
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+        piece, a, b = order // 64, order // 8 % 8, order % 8
+        self.source = 576 * piece + 24 * a + b  # where a block's first entry is in the stiffness
+        self.source_start = np.append(first, len(key))
+        self.column = (key[first] % n_node).astype(np.int32)
+        self.start = np.searchsorted(key[first] // n_node, np.arange(n_node + 1))
+        self.diagonal = np.flatnonzero(key[first] // n_node == self.column)
+        self.value = np.empty((len(first), 9))
+        self.inverse = np.empty((n_node, 9))
+
+    def assemble(self, stiffness: np.ndarray, least: np.ndarray) -> None:
+        """Sum stiffness (n_piece, 3, 8, 3, 8), with diagonal blocks no weaker than ``least`` (n_node,) [N/m]."""
+        _gather(self.source_start, self.source, stiffness.reshape(-1), self.value)
+        _invert_diagonal(self.diagonal, self.value, least, self.inverse)
+
+    def __matmul__(self, x: np.ndarray) -> np.ndarray:
+        y = np.empty_like(x)
+        _multiply(self.start, self.column, self.value, x, y)
+        return y
+
+    def sparse(self) -> scipy.sparse.bsr_matrix:
+        n = len(self.start) - 1
+        return scipy.sparse.bsr_matrix((self.value.reshape(-1, 3, 3), self.column, self.start), shape=(3 * n, 3 * n))
+
+
+class GridSolver:
+    """Solves with the matrix of the finest of some grids.
+
+    Args:
+        grids: From fine to coarse, at least one.
+    """
+
+    def __init__(self, grids: list[Grid]) -> None:
+        self.matrices = [BlockMatrix(g.node, g.n_node) for g in grids]
+        self.up = [interpolation(coarse) for coarse in grids[1:]]
+        self.down = [u.T.tocsr() for u in self.up]
+        self.split = np.cumsum([len(g.node) for g in grids])[:-1]
+
+    def factorise(self, stiffness: np.ndarray, least: list[np.ndarray]) -> None:
+        """Take the stiffness (n_piece, 3, 8, 3, 8) of the pieces of all grids, numbered through."""
+        for matrix, part, low in zip(self.matrices, np.split(stiffness, self.split), least):
+            matrix.assemble(part, low)
+        coarsest = self.matrices[-1].sparse()
+        if coarsest.shape[0] <= DENSE:
+            factor = scipy.linalg.cho_factor(coarsest.toarray(), lower=True, overwrite_a=True, check_finite=False)
+            self._bottom = lambda b: scipy.linalg.cho_solve(factor, b, check_finite=False)
+        else:  # many small bodies: nothing is left to coarsen, and little to fill in
+            self._bottom = scipy.sparse.linalg.splu(coarsest.tocsc()).solve
+
+    def cycle(self, b: np.ndarray, level: int = 0) -> np.ndarray:
+        """One symmetric V-cycle for b (n_node, 3) from zero."""
+        if level == len(self.up):
+            return self._bottom(b.ravel()).reshape(b.shape)
+        m, x = self.matrices[level], np.zeros_like(b)
+        _gauss_seidel(m.start, m.column, m.value, m.inverse, b, x, False)
+        x += self.up[level] @ self.cycle(self.down[level] @ (b - m @ x), level + 1)
+        _gauss_seidel(m.start, m.column, m.value, m.inverse, b, x, True)
+        return x
+
+    def solve(self, b: np.ndarray, tolerance: float, most: int = 30) -> np.ndarray:
+        """Conjugate gradients until the residual, measured by the V-cycle, has fallen by ``tolerance``."""
+        if not self.up:
+            return self.cycle(b)
+        x, r = np.zeros_like(b), b.copy()
+        z = self.cycle(r)
+        p, rz = z.copy(), float(np.vdot(r, z))
+        first = rz
+        for _ in range(most):
+            if not rz > 0:
+                break
+            q = self.matrices[0] @ p
+            alpha = rz / float(np.vdot(p, q))
+            x += alpha * p
+            r -= alpha * q
+            z = self.cycle(r)
+            rz, before = float(np.vdot(r, z)), rz
+            if rz <= tolerance**2 * first:
+                break
+            p = z + (rz / before) * p
+        return x
+
+
+def interpolation(grid: Grid) -> scipy.sparse.csr_matrix:
+    """Weights (n, n_node) of a grid's nodes at the vertices of what it was made for."""
+    n = len(grid.parents)
+    row = np.repeat(np.arange(n), 8)
+    matrix = scipy.sparse.csr_matrix((grid.weights.ravel(), (row, grid.parents.ravel())), (n, grid.n_node))
+    matrix.eliminate_zeros()
+    return matrix
+
+
+@kernel
+def _gather(start, source, stiffness, value):
+    for k in prange(start.size - 1):
+        for n in range(9):
+            value[k, n] = 0.0
+        for s in range(start[k], start[k + 1]):
+            for i in range(3):
+                for j in range(3):
+                    value[k, 3 * i + j] += stiffness[source[s] + 192 * i + 8 * j]
+
+
+@serial
+def _invert_diagonal(diagonal, value, least, inverse):
+    """Raise diagonal blocks weaker than ``least`` and invert them."""
+    for r in range(diagonal.size):
+        a = value[diagonal[r]]
+        lift = max(0.0, least[r] - (a[0] + a[4] + a[8]) / 3)
+        a[0] += lift
+        a[4] += lift
+        a[8] += lift
+        c0, c1, c2 = a[4] * a[8] - a[5] * a[7], a[5] * a[6] - a[3] * a[8], a[3] * a[7] - a[4] * a[6]
+        d = 1 / (a[0] * c0 + a[1] * c1 + a[2] * c2)
+        i = inverse[r]
+        i[0], i[3], i[6] = c0 * d, c1 * d, c2 * d
+        i[1], i[4], i[7] = (
+            (a[2] * a[7] - a[1] * a[8]) * d,
+            (a[0] * a[8] - a[2] * a[6]) * d,
+            (a[1] * a[6] - a[0] * a[7]) * d,
+        )
+        i[2], i[5], i[8] = (
+            (a[1] * a[5] - a[2] * a[4]) * d,
+            (a[2] * a[3] - a[0] * a[5]) * d,
+            (a[0] * a[4] - a[1] * a[3]) * d,
+        )
+
+
+@kernel
+def _multiply(start, column, value, x, y):
+    for chunk in prange((start.size + 254) // 256):
+        for r in range(256 * chunk, min(start.size - 1, 256 * (chunk + 1))):
+            y0, y1, y2 = 0.0, 0.0, 0.0
+            for k in range(start[r], start[r + 1]):
+                a, u = value[k], x[column[k]]
+                y0 += a[0] * u[0] + a[1] * u[1] + a[2] * u[2]
+                y1 += a[3] * u[0] + a[4] * u[1] + a[5] * u[2]
+                y2 += a[6] * u[0] + a[7] * u[1] + a[8] * u[2]
+            y[r, 0], y[r, 1], y[r, 2] = y0, y1, y2
+
+
+@serial
+def _gauss_seidel(start, column, value, inverse, b, x, backwards):
+    n = start.size - 1
+    for turn in range(n):
+        r = n - 1 - turn if backwards else turn
+        r0, r1, r2 = b[r, 0], b[r, 1], b[r, 2]
+        for k in range(start[r], start[r + 1]):
+            c = column[k]
+            if c != r:
+                a, u = value[k], x[c]
+                r0 -= a[0] * u[0] + a[1] * u[1] + a[2] * u[2]
+                r1 -= a[3] * u[0] + a[4] * u[1] + a[5] * u[2]
+                r2 -= a[6] * u[0] + a[7] * u[1] + a[8] * u[2]
+        i = inverse[r]
+        x[r, 0] = i[0] * r0 + i[1] * r1 + i[2] * r2
+        x[r, 1] = i[3] * r0 + i[4] * r1 + i[5] * r2
+        x[r, 2] = i[6] * r0 + i[7] * r1 + i[8] * r2

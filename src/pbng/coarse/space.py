@@ -1,0 +1,153 @@
+"""The coarse space of a problem: trilinear displacements of the free vertices on grids of cells four elements wide."""
+
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from numba import prange
+
+from pbng.coarse.grid import CORNERS, Grid, coarser, make_grid
+from pbng.coarse.linear import DENSE, GridSolver, interpolation
+from pbng.coarse.stiffness import Cubature
+from pbng.jit import kernel
+from pbng.packing import Packed
+from pbng.problem import Problem
+
+WIDTH = 4  # edge of a cell in mean distances of vertices
+LEAST = 2e-3  # of the stiffness of the vertices that a node moves: a node that the cubature missed is no weaker
+TIE = 100.0  # stiffness of the ties of the extension, relative to its Laplacian
+EXTENSION = 6000  # nodes of the finest grid on which constraints are extended
+
+
+class CoarseSpace:
+    """Grids over the rest shape, from fine to coarse, and what the two-grid cycle asks of them.
+
+    Args:
+        problem: What is solved.
+        packed: Its layout.
+    """
+
+    def __init__(self, problem: Problem, packed: Packed) -> None:
+        cells = [g.cells for g in problem.groups]
+        wide = max(c.shape[1] for c in cells)
+        cells_ = np.concatenate([np.concatenate([c, np.repeat(c[:, :1], wide - c.shape[1], 1)], 1) for c in cells])
+        body = np.repeat(np.arange(len(problem.bodies)), [b.stop - b.start for b in problem.bodies])
+        low, size = _cells(problem)
+        self.problem = problem
+        self.grids: list[Grid] = [make_grid(problem.X, cells_, body, low, size)]
+        pieces = [self.grids[0].piece]
+        while 3 * self.grids[-1].n_node > DENSE:
+            next_grid = coarser(self.grids[-1], low, size)
+            if next_grid.n_node > 0.7 * self.grids[-1].n_node:
+                break
+            size = 2 * size
+            pieces.append(next_grid.piece[pieces[-1]])
+            self.grids.append(next_grid)
+        self.cubature = Cubature(problem, self.grids, pieces, packed.slot)
+        self.solver = GridSolver(self.grids)
+        free = np.flatnonzero(~problem.fixed)
+        place = packed.slot[free]
+        n = packed.n_free // 4
+        self.parents, self.weights = np.zeros((n, 8), np.int32), np.zeros((n, 8))
+        self.parents[place], self.weights[place] = self.grids[0].parents[free], self.grids[0].weights[free]
+        row = np.repeat(np.arange(n), 8)
+        up = scipy.sparse.csr_matrix((self.weights.ravel(), (row, self.parents.ravel())), (n, self.grids[0].n_node))
+        up.eliminate_zeros()
+        down = up.T.tocsr()
+        self.restriction = down.indptr.astype(np.int64), down.indices, down.data
+        stiffness, self.least = packed.stiffness(), []
+        for level in range(len(self.grids)):
+            held = LEAST * (up.multiply(up).T @ stiffness)
+            self.least.append(np.maximum(held, 1e-6 * stiffness.mean()))
+            if level < len(self.grids) - 1:
+                up = up @ self.solver.up[level]
+        plane = np.array([b.mesh.cells.shape[1] == 3 for b in problem.bodies])
+        self.moves_z = ~plane[self.grids[0].body]
+
+    def refresh(self, x: np.ndarray) -> None:
+        """Take the stiffness at a flat position array."""
+        self.solver.factorise(self.cubature.evaluate(x), self.least)
+
+    def direction(self, f: np.ndarray, d: np.ndarray, tolerance: float) -> float:
+        """Write d = U y with UᵀHU y = Uᵀf, solved to a tolerance, and return f·d [J]; f and d are flat."""
+        b = np.empty((self.grids[0].n_node, 3))
+        _restrict(*self.restriction, f, b)
+        b[:, 2] *= self.moves_z
+        y = self.solver.solve(b, tolerance)
+        y[:, 2] *= self.moves_z
+        _prolong(self.parents, self.weights, y, d)
+        return float(np.vdot(b, y))
+
+    def extend(self, increment: np.ndarray) -> np.ndarray:
+        """Displacements (n_vert, 3) that extend those of the prescribed vertices (n_fixed, 3) smoothly over the grid."""
+        up, factor, tied = self._extension
+        return up @ factor.solve(tied.T @ increment)
+
+    @cached_property
+    def _extension(self):
+        """A grid and its scalar Laplacian, factorised, with the prescribed vertices tied to their displacements."""
+        level, up = 0, interpolation(self.grids[0])
+        while self.grids[level].n_node > EXTENSION and level + 1 < len(self.grids):
+            up = up @ self.solver.up[level]
+            level += 1
+        grid = self.grids[level]
+        laplacian = _laplacian(grid)
+        at_fixed = up[np.flatnonzero(self.problem.fixed)]
+        scale = laplacian.diagonal().mean()
+        tied = laplacian + 1e-9 * scale * scipy.sparse.identity(grid.n_node) + TIE * scale * (at_fixed.T @ at_fixed)
+        return up, scipy.sparse.linalg.splu(tied.tocsc()), at_fixed * (TIE * scale)
+
+
+def _cells(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Low corner and cell size of each body, (n_body, 3): cells fill its box and hold WIDTH³ vertices or so."""
+    low, size = [], []
+    for b in problem.bodies:
+        extent = np.ptp(b.mesh.X, axis=0)
+        flat = b.mesh.cells.shape[1] == 3
+        spacing = (b.mesh.volume.sum() / b.mesh.n_vert) ** (1 / (2 if flat else 3))
+        number = np.maximum(np.rint(extent / (WIDTH * spacing)), 1)
+        low.append(problem.X[b.start : b.stop].min(0))
+        size.append(np.where(extent > 0, extent / number, 1.0) * (1 + 1e-9))  # the far side lies in the last cell
+    return np.array(low), np.array(size)
+
+
+def _laplacian(grid: Grid) -> scipy.sparse.csr_matrix:
+    """∫ ∇N_a · ∇N_b over the cells of all pieces, (n_node, n_node)."""
+    same = (CORNERS[:, None] == CORNERS[None]).astype(float)  # (8, 8, 3)
+    stiffness, mass = 2 * same - 1, (1 + same) / 6
+    total = np.zeros((len(grid.node), 8, 8))
+    volume = grid.size.prod(1)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        shape = stiffness[..., k] * mass[..., i] * mass[..., j]
+        total += (volume / grid.size[:, k] ** 2)[:, None, None] * shape
+    row, column = np.repeat(grid.node, 8, axis=1), np.tile(grid.node, (1, 8))
+    return scipy.sparse.csr_matrix((total.ravel(), (row.ravel(), column.ravel())), (grid.n_node, grid.n_node))
+
+
+@kernel
+def _restrict(start, place, weight, f, b):
+    """b = Uᵀ f."""
+    for c in prange(start.size - 1):
+        b0, b1, b2 = 0.0, 0.0, 0.0
+        for k in range(start[c], start[c + 1]):
+            i, w = 4 * place[k], weight[k]
+            b0 += w * f[i]
+            b1 += w * f[i + 1]
+            b2 += w * f[i + 2]
+        b[c, 0], b[c, 1], b[c, 2] = b0, b1, b2
+
+
+@kernel
+def _prolong(parents, weights, y, d):
+    """d = U y."""
+    for chunk in prange((parents.shape[0] + 255) // 256):
+        for v in range(256 * chunk, min(parents.shape[0], 256 * (chunk + 1))):
+            d0, d1, d2 = 0.0, 0.0, 0.0
+            for k in range(8):
+                w, u = weights[v, k], y[parents[v, k]]
+                d0 += w * u[0]
+                d1 += w * u[1]
+                d2 += w * u[2]
+            d[4 * v], d[4 * v + 1], d[4 * v + 2], d[4 * v + 3] = d0, d1, d2, 0.0
