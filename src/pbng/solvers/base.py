@@ -138,12 +138,14 @@ class Result:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The state of a solve in float64: residual [N], energy [J], force scale [N], inverted elements."""
+    """The state of a solve in float64: residual [N], energy [J], force scale [N], inverted elements, and an estimate of
+    the largest position error [m], NaN where the method has none."""
 
     residual: float
     energy: float
     force_scale: float
     inverted: int
+    error: float = math.nan
 
 
 @dataclass(frozen=True)
