@@ -103,8 +103,7 @@ def make_evaluate(key: str, dtype: np.dtype):
     ``shift`` is 0 for energy, or the number of terms for forces.
     """
     real = dtype.type
-    wide = np.dtype(np.float64)
-    current, at_rest, results = scratch(16 * W, dtype), scratch(16 * W, wide), scratch(14 * W, wide)
+    n_position, n_result = 16 * W, 14 * W
 
     @body
     def evaluate(arguments, low, high):
@@ -112,7 +111,8 @@ def make_evaluate(key: str, dtype: np.dtype):
         idx, par, f = array(arguments, 3, np.uint32), array(arguments, 4, np.float64), array(arguments, 5, np.float64)
         order, part = array(arguments, 6, np.int64), rows(arguments, 7, 2, np.float64)
         n_block, shift = array(arguments, 8, np.int64)[0], array(arguments, 8, np.int64)[1]
-        gx, gX, out = current(), at_rest(), results()
+        gx, gX = scratch(n_position, real), scratch(n_position, np.float64)
+        out = scratch(n_result, np.float64)
         for turn in range(low, high):
             chunk = order[turn]
             first, second = 0.0, 0.0

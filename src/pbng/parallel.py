@@ -5,14 +5,13 @@ Numba spends about as long on a parallel loop as on the code inside it. A *body*
 Arrays go as addresses too: :func:`array` and :func:`rows` make them arrays again inside the body.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import carray, from_dtype, njit, prange, types
+from numba import carray, njit, prange, types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
 from pbng.jit import FLAGS, inline, kernel
 
@@ -53,26 +52,31 @@ def rows(arguments, j, columns, dtype):
     return carray(_pointer(arguments[j]), (_ENDLESS, columns), dtype)
 
 
-@cache
-def scratch(n: int, dtype: np.dtype) -> Any:
-    """``() -> array``: n numbers on the stack of a body, at a cache line, not initialised.
+def scratch(n, dtype):
+    """n numbers on the stack of a body, at a cache line, not initialised; n must be a constant.
 
     On the stack, LLVM knows that nothing else points there; and asking for a whole line makes it align the stack, where
     it puts what registers cannot hold, which otherwise straddles lines in some processes and not in others.
     """
+    raise TypeError("called from compiled code only")
+
+
+@overload(scratch, prefer_literal=True, jit_options={"forceinline": True, **FLAGS})
+def _(n, dtype):
+    if not isinstance(n, types.IntegerLiteral):
+        return None
+    length, real = n.literal_value, dtype.instance_type
 
     @intrinsic
     def allocate(typing):
-        real = from_dtype(dtype)
-
         def generate(context, builder, signature, values):
-            place = cgutils.alloca_once(builder, ir.ArrayType(context.get_data_type(real), n))
+            place = cgutils.alloca_once(builder, ir.ArrayType(context.get_data_type(real), length))
             place.align = 64
             return builder.bitcast(place, context.get_value_type(types.CPointer(real)))
 
         return types.CPointer(real)(), generate
 
-    return inline(lambda: carray(allocate(), (n,)))
+    return lambda n, dtype: carray(allocate(), (length,))
 
 
 @intrinsic

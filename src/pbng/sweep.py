@@ -46,14 +46,14 @@ def _grain(packed: Packed) -> int:
 def make_sweep(key: str, dtype: np.dtype):
     """Body of :func:`sweep` for blocks low .. high of one colour."""
     real = dtype.type
-    accumulators = scratch(12 * W, dtype)
+    size = 12 * W
 
     @body
     def blocks(arguments, low, high):
         x, seg_start, seg = array(arguments, 0, real), array(arguments, 1, np.int64), rows(arguments, 2, 5, np.int64)
         idx, coef, nodal = array(arguments, 3, np.uint32), array(arguments, 4, real), array(arguments, 5, real)
         par, omega = array(arguments, 6, real), array(arguments, 7, real)[0]
-        acc = accumulators()
+        acc = scratch(size, real)
         g = _aligned(np.empty(12 * W * AHEAD + W, real))  # on the stack too it is a tenth slower, for corotated
         for b in range(low, high):
             _load(uint64(b), x, nodal, acc)

@@ -9,10 +9,13 @@ import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 from numba import prange
+from threadpoolctl import ThreadpoolController
 
 from pbng.coarse.grid import Grid
 from pbng.jit import kernel, serial
 
+# On few cores threads of BLAS only get in the way of Numba's, and their number would show in the last bits.
+_blas = ThreadpoolController()
 DENSE = 1300  # unknowns up to which the coarsest matrix is factorised as a dense one
 
 
@@ -61,6 +64,7 @@ class GridSolver:
         self.down = [u.T.tocsr() for u in self.up]
         self.split = np.cumsum([len(g.node) for g in grids])[:-1]
 
+    @_blas.wrap(limits=1, user_api="blas")
     def factorise(self, stiffness: np.ndarray, least: list[np.ndarray]) -> None:
         """Take the stiffness (n_piece, 3, 8, 3, 8) of the pieces of all grids, numbered through."""
         for matrix, part, low in zip(self.matrices, np.split(stiffness, self.split), least):
@@ -82,6 +86,7 @@ class GridSolver:
         _gauss_seidel(m.start, m.column, m.value, m.inverse, b, x, True)
         return x
 
+    @_blas.wrap(limits=1, user_api="blas")
     def solve(self, b: np.ndarray, tolerance: float, most: int = 30) -> np.ndarray:
         """Conjugate gradients until the residual, measured by the V-cycle, has fallen by ``tolerance``."""
         if not self.up:

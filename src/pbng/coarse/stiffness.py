@@ -132,8 +132,7 @@ def _term(model: Model) -> Any:
 
 def make_pieces(key: str, dtype: np.dtype):
     """Body of :class:`Cubature`: stiffness of pieces low .. high."""
-    real, wide = dtype.type, np.dtype(np.float64)
-    eigenvalues, modes, work_space, motion = scratch(9, wide), scratch(81, wide), scratch(WORK, wide), scratch(216, wide)
+    real = dtype.type
 
     @body
     def pieces(arguments, low, high):
@@ -143,7 +142,8 @@ def make_pieces(key: str, dtype: np.dtype):
         weight, floor = array(arguments, 6, np.float64), array(arguments, 7, np.float64)
         across, par = array(arguments, 8, np.float64), array(arguments, 9, np.float64)
         out = rows(arguments, 10, 576, np.float64)
-        e, M, work, v = eigenvalues(), modes(), work_space(), motion()
+        e, M = scratch(9, np.float64), scratch(81, np.float64)
+        work, v = scratch(WORK, np.float64), scratch(216, np.float64)
         for c in range(low, high):
             K = out[c]
             K[:] = 0.0

@@ -26,6 +26,7 @@ from pbng.solvers.pbng import PBNG, PackedMethod
 
 DECREASE = 1e-4  # of f·Uy: what a correction must lower the energy by
 BACKTRACKS = 6
+SHRINK = 0.5
 COARSE_TOLERANCE = 0.1  # rougher solves save nothing and cost cycles below 1e-4
 
 
@@ -112,12 +113,13 @@ class TwoGrid(PackedMethod):
             return
         Eg, alpha = self.energy(g), 1.0
         for _ in range(BACKTRACKS):
+            # A large rotation, taken along a line, stretches every element; a few sweeps undo that.
+            self.apply(z, self.cycle.omega)
+            self.Ez = self.energy(z)
             if self.Ez <= Eg - DECREASE * alpha * slope + tolerance:
                 return
-            parabola = 0.5 * slope * alpha**2 / max(self.Ez - Eg + slope * alpha, 1e-300)
-            alpha = min(max(parabola, 0.1 * alpha), 0.5 * alpha)
+            alpha *= SHRINK
             np.add(g[:n], alpha * self.d, out=z[:n], casting="same_kind")
-            self.Ez = self.energy(z)
         z[:], self.Ez = g, Eg
 
     def _mix(self) -> None:
