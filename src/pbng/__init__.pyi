@@ -1,7 +1,7 @@
 """The public names: what type checkers read, and what ``__init__.py`` loads lazily."""
 
 from . import gallery as gallery, linalg as linalg, shapes as shapes, view as view
-from .drivers import Frame as Frame, simulate as simulate, solve as solve
+from .drivers import Frame as Frame, default_solver as default_solver, simulate as simulate, solve as solve
 from .errors import InputError as InputError
 from .io.export import export as export
 from .io.frames import FrameWriter as FrameWriter, read_run as read_run
@@ -21,6 +21,7 @@ from .problem import Problem as Problem
 from .scene import Body as Body, Scene as Scene, Selection as Selection
 from .solvers.acceleration import SOR as SOR, Anderson as Anderson, Chebyshev as Chebyshev, NodeSOR as NodeSOR
 from .solvers.base import Budget as Budget, Progress as Progress, Result as Result, Status as Status
+from .solvers.multigrid import MultigridPBNG as MultigridPBNG
 from .solvers.pbng import PBNG as PBNG
 
 __version__: str

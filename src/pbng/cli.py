@@ -58,13 +58,16 @@ def run(
     ] = None,
     solver: Annotated[
         str | None,
-        typer.Option(help="anderson, plain, node-sor, sor, chebyshev; parameters after a colon: anderson:5, sor:1.7."),
+        typer.Option(
+            help="auto, multigrid, anderson, plain, node-sor, sor, chebyshev; parameters after a colon: anderson:5."
+        ),
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="At most so many iterations a frame.")] = None,
     rtol: Annotated[float | None, typer.Option(help="Until the residual of a frame is this part of its first.")] = None,
     atol: Annotated[float | None, typer.Option(help="Until the residual is below this [N].")] = None,
+    error: Annotated[float | None, typer.Option(help="Until the estimated position error is below this [m].")] = None,
     seconds: Annotated[float | None, typer.Option(help="At most so many seconds a frame.")] = None,
-    dtype: Annotated[str | None, typer.Option(help="Precision of the sweeps: float32 or float64.")] = None,
+    dtype: Annotated[str | None, typer.Option(help="Precision of the sweeps: float32, float64 or auto.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads to use; by default all.")] = None,
     frames: Annotated[int | None, typer.Option(help="Frames, the one at time 0 included.")] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
@@ -82,11 +85,14 @@ def run(
 
     with blaming(Path(scene)):
         recipe, name, file = cli_options.recipe(scene, surface, resolution)
+    budget = cli_options.budget(
+        recipe.budget, iterations=iterations, seconds=seconds, rtol=rtol, atol=atol, error=error
+    )
     report = cli_run.run(
         recipe,
         to or Path("runs") / name,
-        solver=cli_options.solver(recipe.solver, solver, dtype, threads),
-        budget=cli_options.budget(recipe.budget, iterations, seconds, rtol, atol),
+        solver=cli_options.solver(recipe.solver, budget, solver, dtype, threads),
+        budget=budget,
         frames=frames,
         fps=fps,
         overwrite=overwrite,

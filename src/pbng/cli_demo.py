@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from pbng import cli_run
 from pbng.cli_console import err, out, table
-from pbng.drivers import solve
+from pbng.drivers import default_solver, solve
 from pbng.errors import InputError
 from pbng.gallery import find
 from pbng.jit import compile_seconds
@@ -42,7 +42,12 @@ def demo(path: Path, resolution: int) -> None:
     for name, what in SCENES.items():
         recipe = find(name)(resolution=resolution)
         report = cli_run.run(
-            recipe, path / name, solver=recipe.solver, budget=recipe.budget, overwrite=True, label=name
+            recipe,
+            path / name,
+            solver=recipe.solver or default_solver(recipe.budget),
+            budget=recipe.budget,
+            overwrite=True,
+            label=name,
         )
         cli_run.summarize(report, compile_seconds())
         cli_run.finish(report)

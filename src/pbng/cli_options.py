@@ -9,6 +9,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
+from pbng.drivers import default_solver
 from pbng.errors import InputError
 from pbng.gallery import SCENES, find
 from pbng.gallery.recipe import Recipe
@@ -16,6 +17,7 @@ from pbng.io.meshes import MESHES, SURFACES
 from pbng.scene import Scene
 from pbng.solvers.acceleration import SOR, Anderson, Chebyshev, NodeSOR
 from pbng.solvers.base import Budget, Solver
+from pbng.solvers.multigrid import MultigridPBNG
 from pbng.solvers.pbng import PBNG
 
 ACCELERATIONS: dict[str, Any] = {
@@ -73,18 +75,22 @@ def _from_file(file: Path, given: Mapping[str, Any]) -> Recipe:
     return made
 
 
-def solver(default: Solver, acceleration: str | None, dtype: str | None, threads: int | None) -> Solver:
-    """The recipe's solver, with what is given in place of its own settings."""
-    given: dict[str, Any] = {"dtype": dtype, "threads": threads}
-    given = {name: value for name, value in given.items() if value is not None}
-    if acceleration is not None:
-        given["acceleration"] = parse_acceleration(acceleration)
-        default = default if isinstance(default, PBNG) else PBNG()
-    if not given:
-        return default
-    if not isinstance(default, PBNG):
-        raise InputError(f"--dtype and --threads are for PBNG, the scene asks for {type(default).__name__}")
-    return replace(default, **given)
+def solver(default: Solver | None, budget: Budget, name: str | None, dtype: str | None, threads: int | None) -> Solver:
+    """The solver that is named, or the recipe's, or the one that suits the budget, with the settings that are given."""
+    chosen: Any = default or default_solver(budget)
+    if name is not None:
+        plain = name.strip().lower()
+        if plain == "auto":
+            chosen = default_solver(budget)
+        elif plain == "multigrid":
+            chosen = MultigridPBNG()
+        else:
+            acceleration = parse_acceleration(name)
+            chosen = replace(chosen if isinstance(chosen, PBNG) else PBNG(), acceleration=acceleration)
+    given = {key: value for key, value in (("dtype", dtype), ("threads", threads)) if value is not None}
+    if given and not isinstance(chosen, PBNG | MultigridPBNG):
+        raise InputError(f"--dtype and --threads are not for {type(chosen).__name__}, which the scene asks for")
+    return replace(chosen, **given)
 
 
 def parse_acceleration(text: str) -> Any:
@@ -96,9 +102,9 @@ def parse_acceleration(text: str) -> Any:
     name, _, values = text.partition(":")
     name = name.strip().lower().replace("_", "-")
     if name not in ACCELERATIONS:
-        near = get_close_matches(name, ACCELERATIONS, n=1)
+        near = get_close_matches(name, [*ACCELERATIONS, "auto", "multigrid"], n=1)
         hint = f"did you mean {near[0]}? " if near else ""
-        raise InputError(f"unknown solver {text!r}; {hint}known are {', '.join(ACCELERATIONS)}")
+        raise InputError(f"unknown solver {text!r}; {hint}known are auto, multigrid, {', '.join(ACCELERATIONS)}")
     kind = ACCELERATIONS[name]
     words = [word for word in values.split(",") if word.strip()]
     parameters = [] if kind is None else list(fields(kind))
@@ -118,10 +124,7 @@ def _number(text: str, name: str, kind: Any, word: str) -> Any:
         raise InputError(f"solver {text!r}: {name} must be {what}, not {word!r}") from None
 
 
-def budget(
-    default: Budget, iterations: int | None, seconds: float | None, rtol: float | None, atol: float | None
-) -> Budget:
+def budget(default: Budget, **limits: float | None) -> Budget:
     """A budget of the limits that are given; if none is, the recipe's."""
-    if iterations is None and seconds is None and rtol is None and atol is None:
-        return default
-    return Budget(iterations=iterations, seconds=seconds, rtol=rtol, atol=atol)
+    given: Any = {name: value for name, value in limits.items() if value is not None}
+    return Budget(**given) if given else default

@@ -211,6 +211,9 @@ def _rows(report: Report, results: list[Result], compiled: float) -> Iterator[tu
         yield "residual, end / start", f"median {np.median(reductions):.1e}, worst {max(reductions):.1e}"
     ends = [r.residual for r in results]
     yield "residual, end", f"median {np.median(ends):.2e} N, worst {max(ends):.2e} N"
+    errors = [r.error for r in results if math.isfinite(r.error)]
+    if errors:
+        yield "position error", f"estimated, median {np.median(errors):.1e} m, worst {max(errors):.1e} m"
     yield "inverted elements", f"{results[-1].inverted:,} at the end, at most {max(r.inverted for r in results):,}"
     yield "solving", f"{seconds:.2f} s, {1e3 * seconds / max(iterations, 1):.2f} ms an iteration"
     yield "set-up, compiling", f"{results[0].setup_seconds:.2f} s, {compiled:.2f} s"

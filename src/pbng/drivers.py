@@ -10,6 +10,7 @@ from pbng.problem import Problem
 from pbng.scene import Scene
 from pbng.solvers.base import Budget, Method, Monitor, Result, Solver, Status
 from pbng.solvers.loop import run
+from pbng.solvers.multigrid import MultigridPBNG
 from pbng.solvers.pbng import PBNG
 
 
@@ -37,7 +38,7 @@ def solve(
 
     Args:
         scene: A scene, or the problem it compiled to.
-        solver: By default ``PBNG()``.
+        solver: By default :func:`default_solver` of the budget.
         budget: By default ``Budget(rtol=1e-3)``.
         at: Time [s] at which motions are taken; by default when all have ended.
         start: Positions [m] (n_vert, 3) to start from; by default the rest state.
@@ -47,9 +48,9 @@ def solve(
         InputError: The scene or the start is not usable.
     """
     problem = scene.compile() if isinstance(scene, Scene) else scene
-    x = _start(problem, start, problem.end if at is None else at)
-    method = (solver or PBNG()).set_up(problem)
-    return _timed(method, run(method, x, budget or Budget(), monitor))
+    x, budget = _start(problem, start), budget or Budget()
+    method = (solver or default_solver(budget)).set_up(problem)
+    return _timed(method, _equilibrium(method, x, problem.end if at is None else at, budget, monitor))
 
 
 def simulate(
@@ -75,37 +76,44 @@ def simulate(
     if frames < 1 or not fps > 0:
         raise InputError(f"simulate: frames must be at least 1 and fps positive, not {frames} and {fps}")
     problem = scene.compile() if isinstance(scene, Scene) else scene
-    return _frames(problem, (solver or PBNG()).set_up(problem), budget or Budget(), frames, fps, start, monitor)
+    x, budget = _start(problem, start), budget or Budget()
+    return _frames((solver or default_solver(budget)).set_up(problem), x, budget, frames, fps, monitor)
+
+
+def default_solver(budget: Budget) -> Solver:
+    """What solves if nothing is said: for an accuracy the two-grid method, for an amount of work alone sweeps.
+
+    See ``docs/choosing.md`` for the measurements behind it.
+    """
+    return MultigridPBNG() if budget.accurate else PBNG()
 
 
 def _frames(
-    problem: Problem,
-    method: Method,
-    budget: Budget,
-    frames: int,
-    fps: float,
-    start: np.ndarray | None,
-    monitor: Monitor | None,
+    method: Method, x: np.ndarray, budget: Budget, frames: int, fps: float, monitor: Monitor | None
 ) -> Iterator[Frame]:
-    x = _start(problem, start, 0.0)
     for k in range(frames):
         t = k / fps
-        result = run(method, problem.constrain(x, t), budget, monitor)
+        result = _equilibrium(method, x, t, budget, monitor)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         result = _timed(method, result) if k == 0 else result
-        yield Frame(k, t, result.x, result, problem)
+        yield Frame(k, t, result.x, result, method.problem)
         x = result.x
+
+
+def _equilibrium(method: Method, x: np.ndarray, t: float, budget: Budget, monitor: Monitor | None) -> Result:
+    """The equilibrium at time t, from the state x before the prescribed vertices moved to where they then belong."""
+    return run(method, method.problem.constrain(x, t), budget, monitor, before=x)
 
 
 def _timed(method: Method, result: Result) -> Result:
     return replace(result, setup_seconds=method.setup_seconds)
 
 
-def _start(problem: Problem, start: np.ndarray | None, t: float) -> np.ndarray:
+def _start(problem: Problem, start: np.ndarray | None) -> np.ndarray:
     x = problem.X if start is None else np.asarray(start, float)
     if x.shape != problem.X.shape:
         raise InputError(f"start must have shape {problem.X.shape}, not {x.shape}")
     if not np.isfinite(x).all():
         raise InputError(f"start is not finite at vertex {np.flatnonzero(~np.isfinite(x).all(1))[0]}")
-    return problem.constrain(x, t)
+    return x

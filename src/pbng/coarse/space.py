@@ -80,7 +80,7 @@ class CoarseSpace:
         return float(np.vdot(b, y))
 
     def extend(self, increment: np.ndarray) -> np.ndarray:
-        """Displacements (n_vert, 3) that extend those of the prescribed vertices (n_fixed, 3) smoothly over the grid."""
+        """Displacements (n_vert, 3) that extend those of the prescribed vertices (n_fixed, 3) over the grid."""
         up, factor, tied = self._extension
         return up @ factor.solve(tied.T @ increment)
 

@@ -1,8 +1,8 @@
 """Stiffness of the grids: UᵀHU with H the positive definite Hessian, by cubature.
 
 The energy of a piece of a cell is summed over a few of its elements, drawn at random and weighted to the volume that
-they stand for. An element's vertices are taken to follow the eight corners of its own piece, so that every piece is like
-one finite element with eight nodes. Constrained vertices follow nothing.
+they stand for. An element's vertices are taken to follow the eight corners of its own piece, so that every piece is
+like one finite element with eight nodes. Constrained vertices follow nothing.
 """
 
 import math
@@ -58,7 +58,9 @@ class Cubature:
             first += len(grid.node)
         e, where = np.concatenate(chosen), np.concatenate(owner)
         cells, gradients = _corners(problem, group, e)
-        origin, size = (np.concatenate([getattr(g, name) for g in grids])[where][:, None] for name in ("origin", "size"))
+        origin, size = (
+            np.concatenate([getattr(g, name) for g in grids])[where][:, None] for name in ("origin", "size")
+        )
         follow = trilinear((problem.X[cells] - origin) / size) * ~problem.fixed[cells][..., None]
         self.models = tuple(dict.fromkeys(g.term.model for g in groups))
         self.parameters, at = group_parameters(groups, np.float64)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from pbng.errors import InputError
 from pbng.scene import Scene
 from pbng.solvers.base import Budget, Solver
-from pbng.solvers.pbng import PBNG
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,14 +15,14 @@ class Recipe:
         scene: What is simulated.
         frames: Frames, the one at time 0 included; by default as many as it takes for every motion to end.
         fps: Frames a second [1/s].
-        solver: Who solves it.
+        solver: Who solves it; by default whoever suits the budget (:func:`pbng.drivers.default_solver`).
         budget: What each frame may take.
     """
 
     scene: Scene
     frames: int | None = None
     fps: float = 30.0
-    solver: Solver = field(default_factory=PBNG)
+    solver: Solver | None = None
     budget: Budget = field(default_factory=Budget)
 
     def __post_init__(self) -> None:

@@ -71,7 +71,9 @@ def _modes(U, S, V, p, h, floor, A, Q, e, M):
         e[n] = max(A[n, n], floor)
         for i in range(3):
             for k in range(3):
-                M[n, 3 * i + k] = Q[0, n] * U[i, 0] * V[k, 0] + Q[1, n] * U[i, 1] * V[k, 1] + Q[2, n] * U[i, 2] * V[k, 2]
+                M[n, 3 * i + k] = (
+                    Q[0, n] * U[i, 0] * V[k, 0] + Q[1, n] * U[i, 1] * V[k, 1] + Q[2, n] * U[i, 2] * V[k, 2]
+                )
 
 
 def _general(stress: Any) -> Any:

@@ -23,17 +23,19 @@ class Budget:
         seconds: At most so many seconds [s], set-up and compilation excluded.
         rtol: Stop when the residual has fallen to this fraction of the first one.
         atol: Stop when the residual norm is below this [N].
-        every: Evaluate the residual every so many iterations; it costs as much as several sweeps.
+        error: Stop when the estimated position error is below this [m]; only methods that estimate it take it.
+        every: Evaluate the residual every so many iterations; by default as often as suits the method's iterations.
     """
 
     iterations: int | None = None
     seconds: float | None = None
     rtol: float | None = None
     atol: float | None = None
-    every: int = 10
+    error: float | None = None
+    every: int | None = None
 
     def __post_init__(self) -> None:
-        for name, low in (("iterations", 0), ("seconds", 0), ("rtol", 0), ("atol", 0), ("every", 1)):
+        for name, low in (("iterations", 0), ("seconds", 0), ("rtol", 0), ("atol", 0), ("error", 0), ("every", 1)):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value >= low):
                 raise InputError(f"Budget: {name} must be finite and at least {low}, not {value}")
@@ -41,8 +43,13 @@ class Budget:
             value = getattr(self, name)
             if value is not None and int(value) != value:
                 raise InputError(f"Budget: {name} must be a whole number, not {value}")
-        if self.iterations is None and self.seconds is None and self.rtol is None and self.atol is None:
+        if self.iterations is None and self.seconds is None and not self.accurate:
             object.__setattr__(self, "rtol", 1e-3)
+
+    @property
+    def accurate(self) -> bool:
+        """Whether it asks for an accuracy, and not only for an amount of work."""
+        return not (self.rtol is None and self.atol is None and self.error is None)
 
     @property
     def cap(self) -> int:
@@ -62,7 +69,7 @@ class Budget:
 class Status(enum.Enum):
     """Why a solve ended, as a sentence."""
 
-    CONVERGED = "The residual met the tolerance."
+    CONVERGED = "The residual, or the estimated error, met the tolerance."
     ITERATIONS = "The iterations of the budget were used up."
     SECONDS = "The time of the budget was used up."
     PRECISION = "The residual reached the floor that rounding the positions leaves; float64 goes below that of float32."
@@ -92,6 +99,7 @@ class Result:
         force_scale: Sum of the norms of all element forces [N] at the end; what the residual is small against.
         inverted: Elements with det F < 0 at the end.
         correction: Largest displacement of a vertex in the last iteration [m].
+        error: Estimate of the largest distance of a vertex from equilibrium [m]; NaN where the method has none.
         seconds: Time of the solve [s], monitoring included, set-up and compilation excluded.
         monitor_seconds: The part of it that went into evaluating residuals [s].
         setup_seconds: Time to set up [s], compilation excluded; zero where a set-up was reused.
@@ -106,6 +114,7 @@ class Result:
     force_scale: float
     inverted: int
     correction: float
+    error: float
     seconds: float
     monitor_seconds: float = 0.0
     setup_seconds: float = 0.0
@@ -168,6 +177,11 @@ class Method(Protocol):
 
     problem: Problem
     setup_seconds: float
+    every: int  # iterations between evaluations of the residual, unless the budget says otherwise
+    estimates_error: bool
+
+    def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
+        """A better state to start from than x (n_vert, 3), which is ``before`` with prescribed vertices moved."""
 
     def start(self, x: np.ndarray) -> None:
         """Take x (n_vert, 3) as the state, with the prescribed vertices where they belong."""
@@ -183,6 +197,9 @@ class Method(Protocol):
 
     def certify(self) -> Certificate:
         """The present state in float64."""
+
+    def refine(self) -> bool:
+        """Go on in a higher precision; False if there is none, or none was asked for."""
 
     def floor(self, dtype: Any = None) -> float:
         """The residual [N] that rounding the positions to a precision, by default the method's, may leave."""

@@ -5,15 +5,23 @@ import time
 
 import numpy as np
 
+from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.solvers.base import Budget, History, Method, Monitor, Progress, Result, Status
 
 
-def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None = None) -> Result:
+def run(
+    method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None = None, before: np.ndarray | None = None
+) -> Result:
     """Iterate from x (n_vert, 3), whose prescribed vertices are in place, until the budget says stop.
 
-    The clock leaves out compilation. Ctrl-C ends the loop with the last state computed.
+    The first residual is that of x. If ``before`` is x with the prescribed vertices where they were until now, the
+    method may then begin at a better state, which it makes from the movement. The clock leaves out compilation. Ctrl-C
+    ends the loop with the last state computed.
     """
+    if budget.error is not None and not method.estimates_error:
+        raise InputError(f"Budget(error={budget.error}): this method has no estimate of the error; use MultigridPBNG")
+    every = budget.every or method.every
     clock, monitoring = _Clock(), _Clock(running=False)
     method.start(x)
     history = History()
@@ -28,8 +36,10 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
     tolerance = budget.tolerance(first)
     if budget.rtol is not None:
         tolerance = max(tolerance, method.floor(np.float64))  # a fraction of rounding cannot be asked for
-    status = _verdict(history, tolerance, floor)
+    status = _verdict(history, tolerance, floor, budget.error)
     iteration, correction = 0, 0.0
+    if status is None and before is not None and (better := method.prepare(before, x)) is not None:
+        method.start(better)
     try:
         while status is None:
             if iteration >= budget.cap:
@@ -37,7 +47,7 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
             elif budget.seconds is not None and clock.seconds() >= budget.seconds and (iteration or not budget.seconds):
                 status = Status.SECONDS
             else:
-                due = (iteration + 1) % budget.every == 0
+                due = (iteration + 1) % every == 0
                 before = method.state() if due or iteration + 1 == budget.cap else None
                 method.step()
                 iteration += 1
@@ -45,7 +55,9 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
                     correction = float(np.linalg.norm(method.state() - before, axis=1).max(initial=0.0))
                 if due:
                     certify(iteration)
-                    status = _verdict(history, tolerance, floor)
+                    status = _verdict(history, tolerance, floor, budget.error)
+                    if status is Status.PRECISION and method.refine():
+                        status, floor = None, method.floor()
                     if monitor is not None:
                         monitor(_progress(history, tolerance, clock.seconds()))
     except KeyboardInterrupt:
@@ -53,7 +65,7 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
     if history.monitored[-1] != iteration:
         certify(iteration)
         if status in (Status.ITERATIONS, Status.SECONDS):
-            status = _verdict(history, tolerance, floor) or status
+            status = _verdict(history, tolerance, floor, budget.error) or status
     return Result(
         x=method.state(),
         status=status,
@@ -64,17 +76,18 @@ def run(method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None =
         force_scale=history.last.force_scale,
         inverted=history.last.inverted,
         correction=correction,
+        error=history.last.error,
         seconds=clock.seconds(),
         monitor_seconds=monitoring.seconds(),
     )
 
 
-def _verdict(history: History, tolerance: float, floor: float) -> Status | None:
+def _verdict(history: History, tolerance: float, floor: float, error: float | None) -> Status | None:
     """Whether the last monitored state ends the loop."""
     residual = history.last.residual
     if not (math.isfinite(residual) and math.isfinite(history.last.energy)):
         return Status.DIVERGED
-    if residual <= tolerance or residual == 0:
+    if residual <= tolerance or residual == 0 or (error is not None and history.last.error <= error):
         return Status.CONVERGED
     # Rounding is what is left once the residual is near its floor and has stopped falling.
     recent, before = history.residuals[-3:], history.residuals[:-3]

@@ -12,6 +12,7 @@ One cycle, from the state x::
 import math
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from pbng.solvers.pbng import PBNG, PackedMethod
 DECREASE = 1e-4  # of f·Uy: what a correction must lower the energy by
 BACKTRACKS = 6
 SHRINK = 0.5
+SLOWEST = 0.9  # rate of convergence that an estimate of the error supposes at most
 COARSE_TOLERANCE = 0.1  # rougher solves save nothing and cost cycles below 1e-4
 
 
@@ -38,14 +40,18 @@ class MultigridPBNG:
         sweeps: Sweeps a cycle; by default 4, and 8 where a material is nearly incompressible (λ > 10 μ).
         omega: Their relaxation, in (0, 2).
         memory: Cycles that Anderson's mixing looks back on; 0 for none.
-        dtype: Precision of the sweeps, "float32" or "float64"; residuals and energies are always float64.
+        start: "extend" to begin with the movement of the prescribed vertices extended over the grid, if that lowers the
+            energy, or "previous" to leave the free vertices where they are.
+        dtype: Precision of the sweeps, "float32", "float64" or "auto": float32 until rounding keeps the residual from
+            falling further, then float64. Residuals and energies are always float64.
         threads: Threads; by default as many as prove fastest, up to all that Numba has. Results do not depend on it.
     """
 
     sweeps: int | None = None
     omega: float = 1.5
     memory: int = 5
-    dtype: Any = "float32"
+    start: str = "extend"
+    dtype: Any = "auto"
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -55,6 +61,8 @@ class MultigridPBNG:
                 raise InputError(f"MultigridPBNG: {name} must be a whole number of at least {low}, not {value}")
         if not 0 < self.omega < 2:
             raise InputError(f"MultigridPBNG: omega must lie strictly between 0 and 2, not {self.omega}")
+        if self.start not in ("extend", "previous"):
+            raise InputError(f"MultigridPBNG: start must be 'extend' or 'previous', not {self.start!r}")
         self.smoother()
 
     def smoother(self) -> PBNG:
@@ -70,6 +78,7 @@ class TwoGrid(PackedMethod):
     """The cycle set up for one problem."""
 
     every = 1
+    estimates_error = True
 
     def __init__(self, problem: Problem, solver: MultigridPBNG) -> None:
         super().__init__(problem, solver.smoother())
@@ -81,19 +90,36 @@ class TwoGrid(PackedMethod):
         stiff = any(g.material.lam > 10 * g.material.mu for g in problem.groups)
         self.colors = np.tile(self.colors, solver.sweeps or (8 if stiff else 4))
         self.d = np.zeros(self.n_free)
-        self.stiffness = np.maximum(self.packed.stiffness(), 1e-300)
-        self.refreshed = False
+        stiffness = self.packed.stiffness().astype(float)
+        self.compliance = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
+        self.total_stiffness = float(stiffness.sum())
+
+    def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
+        fixed = self.problem.fixed
+        increment = x[fixed] - before[fixed]
+        if self.cycle.start == "previous" or not increment.any():
+            return None
+        with self.threads.used():
+            extended = x + self.coarse.extend(increment)
+            extended[fixed] = x[fixed]
+            lower = self.energy(self.packed.pack(extended)) < self.energy(self.packed.pack(x))
+        return extended if lower else None
 
     def start(self, x: np.ndarray) -> None:
         self.x = self.packed.pack(x)
         self.g, self.z = self.x.copy(), self.x.copy()
         self.history = MixingHistory(self.cycle.memory) if self.cycle.memory else None
         self.E = self.energy(self.x)
+        self.refreshed = False
+        self.moved: list[float] = []  # largest displacement of a vertex in each of the last three cycles
 
     def step(self) -> None:
         with self.threads.timed_step():
             self._sweep_and_correct()
+            before = self.x
             self._mix()
+            moved = self.x[: self.n_free] - before[: self.n_free]
+            self.moved = [*self.moved[-2:], float(_lengths(moved).max(initial=0.0))]
 
     def settle(self) -> None:
         pass
@@ -103,9 +129,13 @@ class TwoGrid(PackedMethod):
         n, g, z = self.n_free, self.g, self.z
         g[:] = self.x
         self.apply(g, self.cycle.omega)
+        f = self._force(g)
+        if not np.isfinite(f).all():  # the loop will say so
+            z[:], self.Ez = g, math.nan
+            return
         self.coarse.refresh(g)
         self.refreshed = True
-        slope = self.coarse.direction(self._force(g), self.d, COARSE_TOLERANCE)
+        slope = self.coarse.direction(f, self.d, COARSE_TOLERANCE)
         tolerance = self._noise(g)
         np.add(g[:n], self.d, out=z[:n], casting="same_kind")
         self.Ez = self.energy(z)
@@ -124,13 +154,13 @@ class TwoGrid(PackedMethod):
 
     def _mix(self) -> None:
         """The next x from the last one and z."""
-        n, m = self.n_free, self.g
-        if self.history is not None and self.history.push(self.x[:n], self.z[:n]) and self.history.mix(self.z[:n], m[:n]):
-            E = self.energy(m)
-            if E <= self.Ez + self._noise(m):
-                self.x, self.g, self.E = m, self.x, E
+        n, m, history = self.n_free, self.g, self.history
+        if history is not None and history.push(self.x[:n], self.z[:n]) and history.mix(self.z[:n], m[:n]):
+            energy = self.energy(m)
+            if energy <= self.Ez + self._noise(m):
+                self.x, self.g, self.E = m, self.x, energy
                 return
-            self.history.restart()
+            history.restart()
         self.x, self.z, self.E = self.z, self.x, self.Ez
 
     def _force(self, x: np.ndarray) -> np.ndarray:
@@ -140,7 +170,7 @@ class TwoGrid(PackedMethod):
     def _noise(self, x: np.ndarray) -> float:
         """What rounding may do to an energy [J]."""
         unit = 0.5 * np.finfo(x.dtype).eps * float(np.abs(x).max(initial=0.0))
-        return float(self.stiffness.sum()) * unit**2 + 1e-13 * abs(self.E)
+        return self.total_stiffness * unit**2 + 1e-13 * abs(self.E)
 
     def certify(self) -> Certificate:
         with self.threads.used():
@@ -149,10 +179,23 @@ class TwoGrid(PackedMethod):
             return Certificate(float(np.linalg.norm(f)), self.E, force_scale, inverted, self._error(f))
 
     def _error(self, f: np.ndarray) -> float:
-        """Estimate of the largest position error [m]: where the forces would move the vertices, on the grid and each
-        by itself. Stiffness is that of the last cycle."""
+        """Estimate of the largest position error [m], the larger of two.
+
+        One is where the forces would move the vertices, on the grid and each by itself, by the last cycle's stiffness;
+        far from equilibrium that is too little. The other is what the last displacements add up to if they go on to
+        shrink as they lately did.
+        """
         if not self.refreshed:
             return math.nan
         self.coarse.direction(f, self.d, COARSE_TOLERANCE)
-        away = (self.d.reshape(-1, 4) + f.reshape(-1, 4) / self.stiffness[:, None])[:, :3]
-        return float(np.linalg.norm(away, axis=1).max(initial=0.0))
+        newton = self.d.reshape(-1, 4) + f.reshape(-1, 4) * self.compliance[:, None]
+        estimate = float(_lengths(newton).max(initial=0.0))
+        rates = [b / a for a, b in pairwise(self.moved) if a > 0]
+        rate = min(max(rates, default=0.5), SLOWEST)
+        return max(estimate, self.moved[-1] * rate / (1 - rate)) if self.moved else estimate
+
+
+def _lengths(x: np.ndarray) -> np.ndarray:
+    """Norms of the vectors of a flat array of four components each."""
+    x = x.reshape(-1, 4)
+    return np.sqrt(np.einsum("ij,ij->i", x, x))

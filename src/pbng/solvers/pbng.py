@@ -26,7 +26,8 @@ class PBNG:
         acceleration: :class:`Anderson` (default), :class:`NodeSOR`, :class:`SOR`, :class:`Chebyshev`, as a class or an
             instance, or None for plain sweeps. See ``docs/choosing.md``.
         block: "majorizer", for which no node update can raise the energy, or "paper" for Eq. (32).
-        dtype: Precision of the sweeps, "float32" or "float64"; residuals and energies are always float64.
+        dtype: Precision of the sweeps, "float32", "float64" or "auto": float32 until rounding keeps the residual from
+            falling further, then float64. Residuals and energies are always float64.
         symmetric: Follow each sweep by one in reverse order of the colours (one iteration is then two sweeps).
         threads: Threads; by default as many as prove fastest, up to all that Numba has. Results do not depend on it.
         device: Only "cpu".
@@ -47,13 +48,14 @@ class PBNG:
         object.__setattr__(self, "acceleration", chosen)
         if self.block not in ("majorizer", "paper"):
             raise InputError(f"PBNG: block must be 'majorizer' or 'paper', not {self.block!r}")
-        try:
-            dtype = np.dtype(self.dtype)
-        except TypeError:
-            dtype = np.dtype(object)
-        if dtype not in (np.float32, np.float64):
-            raise InputError(f"PBNG: dtype must be 'float32' or 'float64', not {self.dtype!r}")
-        object.__setattr__(self, "dtype", dtype.name)
+        if self.dtype != "auto":
+            try:
+                dtype = np.dtype(self.dtype)
+            except TypeError:
+                dtype = np.dtype(object)
+            if dtype not in (np.float32, np.float64):
+                raise InputError(f"PBNG: dtype must be 'float32', 'float64' or 'auto', not {self.dtype!r}")
+            object.__setattr__(self, "dtype", dtype.name)
         most = numba.config.NUMBA_NUM_THREADS
         if self.threads is not None and not 1 <= self.threads <= most:
             raise InputError(f"PBNG: threads must lie between 1 and {most}, not {self.threads}")
@@ -68,12 +70,16 @@ class PBNG:
 class PackedMethod:
     """PBNG set up for one problem: the packed layout, the float64 evaluation and an accelerated state."""
 
+    every = 10
+    estimates_error = False
+
     def __init__(self, problem: Problem, solver: PBNG) -> None:
         self.problem, self.solver = problem, solver
         self.threads = Threads(solver.threads)
         start = time.perf_counter() - compile_seconds()
         with self.threads.used():
-            self.packed = pack_problem(problem, np.dtype(solver.dtype), solver.block == "paper")
+            first = np.float32 if solver.dtype == "auto" else solver.dtype
+            self.packed = pack_problem(problem, np.dtype(first), solver.block == "paper")
             X = problem.X - self.packed.origin
             self.blocks = ElementBlocks(problem.groups, X, self.packed.slot, self.packed.n_slot)
         forward = np.arange(len(self.packed.color_start) - 1)
@@ -86,6 +92,18 @@ class PackedMethod:
         self.x = self.packed.pack(problem.X)
         self.iteration: Iteration | None = None
         self.setup_seconds = time.perf_counter() - compile_seconds() - start
+
+    def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
+        return None
+
+    def refine(self) -> bool:
+        if self.solver.dtype != "auto" or self.packed.dtype == np.float64:
+            return False
+        x = self.state()
+        with self.threads.used():
+            self.packed = pack_problem(self.problem, np.dtype(np.float64), self.solver.block == "paper")
+        self.start(x)
+        return True
 
     def start(self, x: np.ndarray) -> None:
         self.x = self.packed.pack(x)
