@@ -22,24 +22,53 @@ from conftest import twisted_bar
 scene = twisted_bar(vertices=(22, 15, 15))
 digests = set()
 for threads in (1, 2, None, 1):
-    solver = pbng.PBNG(pbng.Anderson(memory=4), dtype=sys.argv[1], threads=threads)
-    result = pbng.solve(scene, solver, pbng.Budget(iterations=40, every=10))
-    parts = (result.x, result.residuals, result.energies, np.array([result.force_scale, result.correction]))
+    if sys.argv[2] == "sweeps":
+        solver = pbng.PBNG(pbng.Anderson(memory=4), dtype=sys.argv[1], threads=threads)
+        budget = pbng.Budget(iterations=40)
+    else:
+        solver, budget = pbng.MultigridPBNG(dtype=sys.argv[1], threads=threads), pbng.Budget(iterations=6)
+    result = pbng.solve(scene, solver, budget)
+    parts = (result.x, result.residuals, result.energies)
+    parts += (np.array([result.force_scale, result.correction, result.error]),)
     digests.add(hashlib.sha256(b"".join(p.tobytes() for p in parts)).hexdigest())
     assert result.reduction < 0.5
 print(len(scene.compile().X), *digests)
 """
 
 
+@pytest.mark.parametrize("method", ["sweeps", "multigrid"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_same_bits_for_one_and_two_threads(dtype):
-    """A whole solve with Anderson: positions, residuals, energies; None changes the number on the way."""
+def test_same_bits_for_one_and_two_threads(dtype, method):
+    """A whole solve: positions, residuals, energies, error; None changes the number of threads on the way."""
     path = os.pathsep.join([str(Path(pbng.__file__).parents[1]), str(Path(__file__).parent)])
     env = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": path}
-    out = subprocess.run([sys.executable, "-c", THREADS, dtype], env=env, check=True, capture_output=True, text=True)
+    out = subprocess.run(
+        [sys.executable, "-c", THREADS, dtype, method], env=env, check=True, capture_output=True, text=True
+    )
     n_vert, *digests = out.stdout.split()
     assert int(n_vert) == 4950
     assert len(digests) == 1
+
+
+CACHED = """
+import pbng
+from conftest import twisted_bar
+from models import SoftVolume
+from pbng.jit import compile_seconds
+
+for solver in (pbng.PBNG(dtype="auto"), pbng.MultigridPBNG()):
+    pbng.solve(twisted_bar(SoftVolume(E=1e5, nu=0.3)), solver, pbng.Budget(rtol=1e-9, iterations=300))
+print(compile_seconds())
+"""
+
+
+def test_a_second_process_compiles_nothing():
+    """Every kernel is found in the cache, in both precisions, for a user's material too."""
+    path = os.pathsep.join([str(Path(pbng.__file__).parents[1]), str(Path(__file__).parent)])
+    env = {**os.environ, "PYTHONPATH": path}
+    for _ in range(2):
+        out = subprocess.run([sys.executable, "-c", CACHED], env=env, check=True, capture_output=True, text=True)
+    assert float(out.stdout) == 0
 
 
 def test_same_bits_when_run_again():

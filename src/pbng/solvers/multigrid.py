@@ -23,12 +23,14 @@ from pbng.jit import compile_seconds
 from pbng.problem import Problem
 from pbng.solvers.acceleration import MixingHistory
 from pbng.solvers.base import Certificate
-from pbng.solvers.pbng import PBNG, PackedMethod
+from pbng.solvers.pbng import PBNG, PackedMethod, checked_dtype
+from pbng.solvers.threads import check_threads
 
 DECREASE = 1e-4  # of f·Uy: what a correction must lower the energy by
 BACKTRACKS = 6
 SHRINK = 0.5
 SLOWEST = 0.9  # rate of convergence that an estimate of the error supposes at most
+TOO_LITTLE = 10  # how much larger than a Newton step it supposes the error to be, at most
 COARSE_TOLERANCE = 0.1  # rougher solves save nothing and cost cycles below 1e-4
 
 
@@ -63,7 +65,8 @@ class MultigridPBNG:
             raise InputError(f"MultigridPBNG: omega must lie strictly between 0 and 2, not {self.omega}")
         if self.start not in ("extend", "previous"):
             raise InputError(f"MultigridPBNG: start must be 'extend' or 'previous', not {self.start!r}")
-        self.smoother()
+        object.__setattr__(self, "dtype", checked_dtype("MultigridPBNG", self.dtype))
+        check_threads("MultigridPBNG", self.threads)
 
     def smoother(self) -> PBNG:
         """The method whose sweeps a cycle takes."""
@@ -111,15 +114,14 @@ class TwoGrid(PackedMethod):
         self.history = MixingHistory(self.cycle.memory) if self.cycle.memory else None
         self.E = self.energy(self.x)
         self.refreshed = False
-        self.moved: list[float] = []  # largest displacement of a vertex in each of the last three cycles
+        self.moved: list[float] = []  # largest movement of a vertex in each of the last three cycles [m]
 
     def step(self) -> None:
         with self.threads.timed_step():
             self._sweep_and_correct()
             before = self.x
             self._mix()
-            moved = self.x[: self.n_free] - before[: self.n_free]
-            self.moved = [*self.moved[-2:], float(_lengths(moved).max(initial=0.0))]
+            self.moved = [*self.moved[-2:], _longest(self.x[: self.n_free] - before[: self.n_free])]
 
     def settle(self) -> None:
         pass
@@ -179,23 +181,23 @@ class TwoGrid(PackedMethod):
             return Certificate(float(np.linalg.norm(f)), self.E, force_scale, inverted, self._error(f))
 
     def _error(self, f: np.ndarray) -> float:
-        """Estimate of the largest position error [m], the larger of two.
+        """Estimate of the largest position error [m].
 
-        One is where the forces would move the vertices, on the grid and each by itself, by the last cycle's stiffness;
-        far from equilibrium that is too little. The other is what the last displacements add up to if they go on to
-        shrink as they lately did.
+        A Newton step tells where the forces would move the vertices, on the grid and each by itself. With Hessians made
+        positive definite that may be too little by a factor of a few; what the last movements add up to, if they go on
+        to shrink as they lately did, tells how much.
         """
         if not self.refreshed:
             return math.nan
         self.coarse.direction(f, self.d, COARSE_TOLERANCE)
-        newton = self.d.reshape(-1, 4) + f.reshape(-1, 4) * self.compliance[:, None]
-        estimate = float(_lengths(newton).max(initial=0.0))
+        newton = _longest(self.d + f * np.repeat(self.compliance, 4))
         rates = [b / a for a, b in pairwise(self.moved) if a > 0]
         rate = min(max(rates, default=0.5), SLOWEST)
-        return max(estimate, self.moved[-1] * rate / (1 - rate)) if self.moved else estimate
+        to_come = self.moved[-1] * rate / (1 - rate) if self.moved else 0.0
+        return max(newton, min(to_come, TOO_LITTLE * newton))
 
 
-def _lengths(x: np.ndarray) -> np.ndarray:
-    """Norms of the vectors of a flat array of four components each."""
+def _longest(x: np.ndarray) -> float:
+    """Largest norm of the vectors of a flat array of four components each."""
     x = x.reshape(-1, 4)
-    return np.sqrt(np.einsum("ij,ij->i", x, x))
+    return math.sqrt(np.einsum("ij,ij->i", x, x).max(initial=0.0))

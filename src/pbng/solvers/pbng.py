@@ -4,7 +4,6 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-import numba
 import numpy as np
 
 from pbng.assembly import ElementBlocks
@@ -14,7 +13,7 @@ from pbng.packing import pack_problem
 from pbng.problem import Problem
 from pbng.solvers.acceleration import Acceleration, Anderson, Iteration, NodeSOR
 from pbng.solvers.base import Certificate
-from pbng.solvers.threads import Threads
+from pbng.solvers.threads import Threads, check_threads
 from pbng.sweep import sweep
 
 
@@ -48,23 +47,27 @@ class PBNG:
         object.__setattr__(self, "acceleration", chosen)
         if self.block not in ("majorizer", "paper"):
             raise InputError(f"PBNG: block must be 'majorizer' or 'paper', not {self.block!r}")
-        if self.dtype != "auto":
-            try:
-                dtype = np.dtype(self.dtype)
-            except TypeError:
-                dtype = np.dtype(object)
-            if dtype not in (np.float32, np.float64):
-                raise InputError(f"PBNG: dtype must be 'float32', 'float64' or 'auto', not {self.dtype!r}")
-            object.__setattr__(self, "dtype", dtype.name)
-        most = numba.config.NUMBA_NUM_THREADS
-        if self.threads is not None and not 1 <= self.threads <= most:
-            raise InputError(f"PBNG: threads must lie between 1 and {most}, not {self.threads}")
+        object.__setattr__(self, "dtype", checked_dtype("PBNG", self.dtype))
+        check_threads("PBNG", self.threads)
         if self.device != "cpu":
             raise InputError(f"PBNG: device must be 'cpu', not {self.device!r}")
 
     def set_up(self, problem: Problem) -> "PackedMethod":
         """Colour and pack a problem."""
         return PackedMethod(problem, self)
+
+
+def checked_dtype(who: str, dtype: Any) -> str:
+    """The name of a precision, or "auto"; InputError if it is neither."""
+    if dtype == "auto":
+        return "auto"
+    try:
+        real = np.dtype(dtype)
+    except TypeError:
+        real = np.dtype(object)
+    if real not in (np.float32, np.float64):
+        raise InputError(f"{who}: dtype must be 'float32', 'float64' or 'auto', not {dtype!r}")
+    return real.name
 
 
 class PackedMethod:

@@ -6,10 +6,18 @@ from contextlib import contextmanager
 
 import numba
 
+from pbng.errors import InputError
 from pbng.jit import compile_seconds
 
 FIRST_PROBE, LAST_PROBE = 16, 512  # steps between trials of another number; doubled whenever a trial brings nothing
 GAIN = 0.9  # a trial must be faster by this factor to be adopted
+
+
+def check_threads(who: str, count: int | None) -> None:
+    """InputError if there are not so many threads."""
+    most = numba.config.NUMBA_NUM_THREADS
+    if count is not None and not 1 <= count <= most:
+        raise InputError(f"{who}: threads must lie between 1 and {most}, not {count}")
 
 
 class Threads:
