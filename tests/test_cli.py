@@ -120,7 +120,7 @@ def test_version(pbng_):
         ("run twisting_block --resolution 4 --iterations -2", "iterations must be"),
         ("run twisting_block --resolution 4 --frames 0", "frames must be at least 1"),
         ("run twisting_block --resolution 4 --fps 0", "fps must be positive, not 0"),
-        ("run twisting_block --resolution 4 --solver andersen", "known are anderson, plain"),
+        ("run twisting_block --resolution 4 --solver andersen", "known are auto, multigrid, anderson, plain"),
         ("run twisting_block --resolution 4 --solver anderson:x", "memory must be a whole number, not 'x'"),
         ("run twisting_block --resolution 4 --solver plain:1", "plain takes no parameter"),
         ("run twisting_block --resolution 4 --solver node-sor:2.5", "omega must lie strictly between 0 and 2, not 2.5"),

@@ -43,7 +43,6 @@ inline = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, 
 leaf = njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, cache=True, **FLAGS)
 function = njit(forceinline=True, **FLAGS)  # an inlined helper that Python can call too
 kernel = njit(parallel=True, cache=True, **FLAGS)  # a module-level parallel loop, cached on disk
-exact = njit(parallel=True, cache=True, error_model="numpy")  # the same, sums in the order that is written
 serial = njit(cache=True, error_model="numpy")  # a module-level serial loop, cached on disk
 
 

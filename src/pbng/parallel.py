@@ -32,6 +32,11 @@ def run(body: Any, arrays: tuple[np.ndarray, ...], sets: np.ndarray, start: np.n
     _run(_address(body), np.array([a.__array_interface__["data"][0] for a in arrays]), sets, start, grain)
 
 
+def each(body: Any, arrays: tuple[np.ndarray, ...], n: int, grain: int = 1) -> None:
+    """Call a body for the range 0 .. n, in parallel; as :func:`run`."""
+    run(body, arrays, np.array([0]), np.array([0, n]), grain)
+
+
 def _address(body: Any) -> int:
     compiled = body.overloads.get(_SIGNATURE)
     if compiled is None:

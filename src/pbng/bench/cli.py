@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-app = typer.Typer(help="Measure: time of a sweep, convergence.", no_args_is_help=True)
+app = typer.Typer(help="Measure: time of a sweep, convergence, accuracy.", no_args_is_help=True)
 console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 170)  # tables are wide
 
 
@@ -102,6 +102,113 @@ def convergence_command(
         rows,
     )
     write(record, "convergence", rows)
+
+
+@app.command("accuracy")
+def accuracy_command(
+    n: Annotated[int, typer.Option("--n", help="Vertices along an edge of the block.")] = 32,
+    model: Annotated[str, typer.Option(help="Model to measure.")] = "corotated",
+    nu: Annotated[float, typer.Option(help="Poisson's ratio.")] = 0.3,
+    seconds: Annotated[float, typer.Option(help="Seconds of solving by each method.", min=0.001)] = 4.0,
+    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
+    out: Annotated[Path | None, typer.Option(help="Folder for the figure.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+) -> None:
+    """Residual and true position error against seconds, by method: the block of ``convergence``."""
+    from pbng.bench import accuracy
+
+    curves = accuracy.measure(n, model, nu, seconds, threads)
+    about = f"{n}³ vertices, {model}, ν = {nu}"
+    if out is not None:
+        accuracy.draw(curves, out / f"accuracy_{n}_{model}_{nu}.png", about)
+    rows = [{"n": n, "model": model, "nu": nu, "method": name} | accuracy.row(c) for name, c in curves.items()]
+    ratios = [Column(f"{level:.0e}", f"ratio {level:.0e}", "{:.3f}") for level in accuracy.RATIOS]
+    errors = [Column(f"error {level:.0e}", f"error {level:.0e}", "{:.3f}") for level in accuracy.ERRORS]
+    show(
+        f"Seconds to a residual ratio and to a position error / size, {about}, {threads} threads, float32",
+        [
+            Column("method", "method"),
+            *ratios,
+            *errors,
+            Column("last ratio", "last_ratio", "{:.1e}"),
+            Column("last error", "last_error", "{:.1e}"),
+            Column("ms/iteration", "ms", "{:.2f}"),
+        ],
+        rows,
+    )
+    write(record, "accuracy", rows)
+
+
+@app.command("cycles")
+def cycles_command(
+    n: Annotated[list[int], typer.Option("--n", help="Vertices along an edge of the block.")] = [16, 32, 64],  # noqa: B006
+    model: Annotated[list[str], typer.Option(help="Models to measure.")] = [  # noqa: B006
+        "corotated",
+        "neo-hookean",
+        "stable-neo-hookean",
+    ],
+    nu: Annotated[list[float], typer.Option(help="Poisson's ratios.")] = [0.3, 0.45, 0.49],  # noqa: B006
+    dtype: str = "float32",
+    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
+    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+) -> None:
+    """Cycles of the two-grid method to a residual ratio: the block of ``convergence``."""
+    from pbng.bench import cycles
+
+    rows = [cycles.measure(m, name, v, dtype, threads) for m in n for name in model for v in nu]
+    show(
+        f"Cycles to a residual ratio, {dtype}, {threads} threads",
+        [Column("n", "n"), Column("tets", "tets", "{:,}"), Column("model", "model"), Column("ν", "nu")]
+        + [Column(f"{level:.0e}", f"{level:.0e}") for level in cycles.LEVELS]
+        + [Column("ms/cycle", "ms", "{:.1f}")]
+        + [Column(f"s to {level:.0e}", f"s {level:.0e}", "{:.3f}") for level in cycles.TIMED]
+        + [
+            Column("set-up [s]", "setup_s", "{:.2f}"),
+            Column("peak [MB]", "peak_MB", "{:.0f}"),
+            Column("last", "last", "{:.1e}"),
+            Column("inverted", "inverted"),
+            Column("status", "status"),
+        ],
+        rows,
+    )
+    write(record, "cycles", rows)
+
+
+@app.command("poses")
+def poses_command(
+    count: Annotated[int, typer.Option(help="Number of random poses.", min=1)] = 100,
+    n: Annotated[int, typer.Option("--n", help="Vertices across the bar.")] = 16,
+    error: Annotated[float, typer.Option(help="Largest position error / length of the bar to ask for.")] = 1e-4,
+    model: Annotated[str, typer.Option(help="Model to measure.")] = "corotated",
+    nu: Annotated[float, typer.Option(help="Poisson's ratio.")] = 0.3,
+    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
+    seed: int = 0,
+    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+) -> None:
+    """Random poses of a bar, each solved to a position error: is the estimate to be trusted?"""
+    from pbng.bench import poses
+
+    rows = poses.measure(count, n, error, model, nu, threads, seed)
+    total = poses.summary(rows)
+    show(
+        f"A bar 2 x 1 x 1, {n} vertices across, {model}, ν = {nu}, error / length {error:g}, {threads} threads",
+        [
+            Column("poses", "poses"),
+            Column("certified", "certified"),
+            Column("falsely", "falsely"),
+            Column("no reference", "unknown"),
+            Column("true / estimate", "true/estimate", "{:.2f}"),
+            Column("worst", "worst true/estimate", "{:.2f}"),
+            Column("cycles", "cycles", "{:g}"),
+            Column("most", "most cycles"),
+            Column("ms", "ms", "{:.1f}"),
+            Column("most", "most ms", "{:.1f}"),
+            Column("set-up [s]", "setup_s", "{:.2f}"),
+            Column("with inverted tets", "inverted"),
+        ],
+        [total],
+    )
+    write(record, "poses", [total | {"each": rows}])
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
-from numba import prange
 from threadpoolctl import ThreadpoolController
 
 from pbng.coarse.grid import Grid
-from pbng.jit import kernel, serial
+from pbng.jit import serial
+from pbng.parallel import array, body, each, rows
 
 # On few cores threads of BLAS only get in the way of Numba's, and their number would show in the last bits.
 _blas = ThreadpoolController()
@@ -38,12 +38,12 @@ class BlockMatrix:
 
     def assemble(self, stiffness: np.ndarray, least: np.ndarray) -> None:
         """Sum stiffness (n_piece, 3, 8, 3, 8), with diagonal blocks no weaker than ``least`` (n_node,) [N/m]."""
-        _gather(self.source_start, self.source, stiffness.reshape(-1), self.value)
+        each(_gather, (self.source_start, self.source, stiffness, self.value), len(self.value), grain=1024)
         _invert_diagonal(self.diagonal, self.value, least, self.inverse)
 
     def __matmul__(self, x: np.ndarray) -> np.ndarray:
         y = np.empty_like(x)
-        _multiply(self.start, self.column, self.value, x, y)
+        each(_multiply, (self.start, self.column, self.value, x, y), len(x), grain=256)
         return y
 
     def sparse(self) -> scipy.sparse.bsr_matrix:
@@ -119,11 +119,13 @@ def interpolation(grid: Grid) -> scipy.sparse.csr_matrix:
     return matrix
 
 
-@kernel
-def _gather(start, source, stiffness, value):
-    for k in prange(start.size - 1):
-        for n in range(9):
-            value[k, n] = 0.0
+@body
+def _gather(arguments, low, high):
+    """Body that sums blocks low .. high."""
+    start, source = array(arguments, 0, np.int64), array(arguments, 1, np.int64)
+    stiffness, value = array(arguments, 2, np.float64), rows(arguments, 3, 9, np.float64)
+    for k in range(low, high):
+        value[k] = 0.0
         for s in range(start[k], start[k + 1]):
             for i in range(3):
                 for j in range(3):
@@ -155,17 +157,23 @@ def _invert_diagonal(diagonal, value, least, inverse):
         )
 
 
-@kernel
-def _multiply(start, column, value, x, y):
-    for chunk in prange((start.size + 254) // 256):
-        for r in range(256 * chunk, min(start.size - 1, 256 * (chunk + 1))):
-            y0, y1, y2 = 0.0, 0.0, 0.0
-            for k in range(start[r], start[r + 1]):
-                a, u = value[k], x[column[k]]
-                y0 += a[0] * u[0] + a[1] * u[1] + a[2] * u[2]
-                y1 += a[3] * u[0] + a[4] * u[1] + a[5] * u[2]
-                y2 += a[6] * u[0] + a[7] * u[1] + a[8] * u[2]
-            y[r, 0], y[r, 1], y[r, 2] = y0, y1, y2
+@body
+def _multiply(arguments, low, high):
+    """Body of the product of a matrix and a vector, for rows low .. high."""
+    start, column = array(arguments, 0, np.int64), array(arguments, 1, np.int32)
+    value, x, y = (
+        rows(arguments, 2, 9, np.float64),
+        rows(arguments, 3, 3, np.float64),
+        rows(arguments, 4, 3, np.float64),
+    )
+    for r in range(low, high):
+        y0, y1, y2 = 0.0, 0.0, 0.0
+        for k in range(start[r], start[r + 1]):
+            a, u = value[k], x[column[k]]
+            y0 += a[0] * u[0] + a[1] * u[1] + a[2] * u[2]
+            y1 += a[3] * u[0] + a[4] * u[1] + a[5] * u[2]
+            y2 += a[6] * u[0] + a[7] * u[1] + a[8] * u[2]
+        y[r, 0], y[r, 1], y[r, 2] = y0, y1, y2
 
 
 @serial

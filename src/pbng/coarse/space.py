@@ -5,13 +5,13 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-from numba import prange
+from numba import uint64
 
 from pbng.coarse.grid import CORNERS, Grid, coarser, make_grid
 from pbng.coarse.linear import DENSE, GridSolver, interpolation
 from pbng.coarse.stiffness import Cubature
-from pbng.jit import kernel
 from pbng.packing import Packed
+from pbng.parallel import array, body, each, rows
 from pbng.problem import Problem
 
 WIDTH = 4  # edge of a cell in mean distances of vertices
@@ -55,7 +55,7 @@ class CoarseSpace:
         up = scipy.sparse.csr_matrix((self.weights.ravel(), (row, self.parents.ravel())), (n, self.grids[0].n_node))
         up.eliminate_zeros()
         down = up.T.tocsr()
-        self.restriction = down.indptr.astype(np.int64), down.indices, down.data
+        self.restriction = down.indptr.astype(np.int64), down.indices.astype(np.int32), down.data
         stiffness, self.least = packed.stiffness(), []
         for level in range(len(self.grids)):
             held = LEAST * (up.multiply(up).T @ stiffness)
@@ -72,11 +72,11 @@ class CoarseSpace:
     def direction(self, f: np.ndarray, d: np.ndarray, tolerance: float) -> float:
         """Write d = U y with UᵀHU y = Uᵀf, solved to a tolerance, and return f·d [J]; f and d are flat."""
         b = np.empty((self.grids[0].n_node, 3))
-        _restrict(*self.restriction, f, b)
+        each(_restrict, (*self.restriction, f, b), len(b), grain=64)
         b[:, 2] *= self.moves_z
         y = self.solver.solve(b, tolerance)
         y[:, 2] *= self.moves_z
-        _prolong(self.parents, self.weights, y, d)
+        each(_prolong, (self.parents, self.weights, y, d), len(self.parents), grain=512)
         return float(np.vdot(b, y))
 
     def extend(self, increment: np.ndarray) -> np.ndarray:
@@ -126,28 +126,31 @@ def _laplacian(grid: Grid) -> scipy.sparse.csr_matrix:
     return scipy.sparse.csr_matrix((total.ravel(), (row.ravel(), column.ravel())), (grid.n_node, grid.n_node))
 
 
-@kernel
-def _restrict(start, place, weight, f, b):
-    """b = Uᵀ f."""
-    for c in prange(start.size - 1):
+@body
+def _restrict(arguments, low, high):
+    """Body of b = Uᵀ f for nodes low .. high."""
+    start, place, weight = array(arguments, 0, np.int64), array(arguments, 1, np.int32), array(arguments, 2, np.float64)
+    f, b = array(arguments, 3, np.float64), rows(arguments, 4, 3, np.float64)
+    for c in range(low, high):
         b0, b1, b2 = 0.0, 0.0, 0.0
         for k in range(start[c], start[c + 1]):
-            i, w = 4 * place[k], weight[k]
+            i, w = uint64(4) * uint64(place[k]), weight[k]
             b0 += w * f[i]
-            b1 += w * f[i + 1]
-            b2 += w * f[i + 2]
+            b1 += w * f[i + uint64(1)]
+            b2 += w * f[i + uint64(2)]
         b[c, 0], b[c, 1], b[c, 2] = b0, b1, b2
 
 
-@kernel
-def _prolong(parents, weights, y, d):
-    """d = U y."""
-    for chunk in prange((parents.shape[0] + 255) // 256):
-        for v in range(256 * chunk, min(parents.shape[0], 256 * (chunk + 1))):
-            d0, d1, d2 = 0.0, 0.0, 0.0
-            for k in range(8):
-                w, u = weights[v, k], y[parents[v, k]]
-                d0 += w * u[0]
-                d1 += w * u[1]
-                d2 += w * u[2]
-            d[4 * v], d[4 * v + 1], d[4 * v + 2], d[4 * v + 3] = d0, d1, d2, 0.0
+@body
+def _prolong(arguments, low, high):
+    """Body of d = U y for vertices low .. high."""
+    parents, weights = rows(arguments, 0, 8, np.int32), rows(arguments, 1, 8, np.float64)
+    y, d = rows(arguments, 2, 3, np.float64), rows(arguments, 3, 4, np.float64)
+    for v in range(low, high):
+        d0, d1, d2 = 0.0, 0.0, 0.0
+        for k in range(8):
+            w, p = weights[v, k], parents[v, k]
+            d0 += w * y[p, 0]
+            d1 += w * y[p, 1]
+            d2 += w * y[p, 2]
+        d[v, 0], d[v, 1], d[v, 2], d[v, 3] = d0, d1, d2, 0.0

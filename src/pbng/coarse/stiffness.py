@@ -12,15 +12,10 @@ from typing import Any
 import numpy as np
 from numba import uint64
 
-from pbng.assembly import group_parameters
 from pbng.coarse.grid import Grid, trilinear
-from pbng.dispatch import call, specialised
-from pbng.elements.base import parameters
 from pbng.jit import inline, serial
-from pbng.linalg import combine
-from pbng.materials.base import Model
-from pbng.materials.hessian import WORK, hessian
-from pbng.parallel import array, body, rows, run, scratch
+from pbng.materials.hessian import hessians
+from pbng.parallel import array, body, each, rows
 from pbng.problem import Problem
 
 SAMPLES = 8  # elements drawn in each piece from each stratum; 4 are too few
@@ -62,10 +57,14 @@ class Cubature:
             np.concatenate([getattr(g, name) for g in grids])[where][:, None] for name in ("origin", "size")
         )
         follow = trilinear((problem.X[cells] - origin) / size) * ~problem.fixed[cells][..., None]
-        self.models = tuple(dict.fromkeys(g.term.model for g in groups))
-        self.parameters, at = group_parameters(groups, np.float64)
-        table = np.array([(self.models.index(g.term.model), p + 1) for g, p in zip(groups, at)])
-        self.term = np.ascontiguousarray(table[group[e]])
+        models = dict.fromkeys(g.term.model for g in groups)
+        self.terms = []  # model, its samples, and their parameters
+        for model in models:
+            numbers = {n: g.material.parameters() for n, g in enumerate(groups) if g.term.model == model}
+            mine = np.flatnonzero(np.isin(group[e], list(numbers)))
+            table = np.zeros((len(groups), model.n_parameters))
+            table[list(numbers)] = list(numbers.values())
+            self.terms.append((model, mine, table[group[e[mine]]]))
         self.floor = FLOOR * np.array([g.material.mu for g in groups])[group[e]]
         self.place = (4 * slot[cells]).astype(np.int64)
         self.gradients = gradients.reshape(-1, 3 * CORNERS)
@@ -77,12 +76,14 @@ class Cubature:
 
     def evaluate(self, x: np.ndarray) -> np.ndarray:
         """Stiffness (n_piece, 3, 8, 3, 8) [N/m] of the corners' directions at a flat position array."""
-        bodies = specialised(make_pieces, tuple(_term(model) for model in self.models), x.dtype)
-        arrays = (
-            x, self.start, self.term, self.place, self.gradients, self.coarse, self.weight, self.floor, self.across,
-            self.parameters, self.stiffness,
-        )  # fmt: skip
-        run(bodies, arrays, np.array([0]), np.array([0, len(self.stiffness)]), grain=16)
+        n = len(self.weight)
+        F, e, M = np.empty((n, 3, 3)), np.empty((n, 9)), np.empty((n, 9, 9))
+        deformation = make_deformation(x.dtype)
+        each(deformation, (x, self.place, self.gradients, self.across, F), n, grain=256)
+        for model, mine, numbers in self.terms:
+            e[mine], M[mine] = hessians(model, F[mine], numbers, self.floor[mine])
+        arrays = self.start, e, M, self.weight, self.coarse, self.stiffness
+        each(_pieces, arrays, len(self.stiffness), grain=16)
         return self.stiffness
 
 
@@ -122,55 +123,39 @@ def _sample(deck, stratum, volume, n_stratum):
 
 
 @cache
-def _term(model: Model) -> Any:
-    numbers, positive_hessian = parameters(model.n_parameters), hessian(model)
-
-    @inline
-    def term(F, par, p, floor, e, M, work):
-        positive_hessian(F, numbers(par, p), floor, e, M, work)
-
-    return term
-
-
-def make_pieces(key: str, dtype: np.dtype):
-    """Body of :class:`Cubature`: stiffness of pieces low .. high."""
+def make_deformation(dtype: np.dtype) -> Any:
+    """Body that writes F = Σ_a x_a ⊗ ∂N_a/∂X in float64 for elements low .. high."""
     real = dtype.type
 
     @body
-    def pieces(arguments, low, high):
-        x, start = array(arguments, 0, real), array(arguments, 1, np.int64)
-        term, place = rows(arguments, 2, 2, np.int64), rows(arguments, 3, CORNERS, np.int64)
-        gradients, coarse = rows(arguments, 4, 3 * CORNERS, np.float64), rows(arguments, 5, 24, np.float64)
-        weight, floor = array(arguments, 6, np.float64), array(arguments, 7, np.float64)
-        across, par = array(arguments, 8, np.float64), array(arguments, 9, np.float64)
-        out = rows(arguments, 10, 576, np.float64)
-        e, M = scratch(9, np.float64), scratch(81, np.float64)
-        work, v = scratch(WORK, np.float64), scratch(216, np.float64)
-        for c in range(low, high):
-            K = out[c]
-            K[:] = 0.0
-            for s in range(start[c], start[c + 1]):
-                F = _deformation(x, place[s], gradients[s], across[s])
-                call(key, term[s, 0], (F, par, uint64(term[s, 1]), floor[s], e, M.reshape((9, 9)), work))
-                _add(e, M, weight[s], coarse[s], v, K)
+    def deformation(arguments, low, high):
+        x, place = array(arguments, 0, real), rows(arguments, 1, CORNERS, np.int64)
+        gradients, across = rows(arguments, 2, 3 * CORNERS, np.float64), array(arguments, 3, np.float64)
+        F = rows(arguments, 4, 9, np.float64)
+        for s in range(low, high):
+            F[s] = 0.0
+            F[s, 8] = across[s]
+            for a in range(CORNERS):
+                for i in range(3):
+                    u = np.float64(x[place[s, a] + i])
+                    for k in range(3):
+                        F[s, 3 * i + k] += u * gradients[s, 3 * a + k]
 
-    return pieces
+    return deformation
 
 
-@inline
-def _deformation(x, place, gradients, across):
-    """F = Σ_a x_a ⊗ ∂N_a/∂X as columns in float64; ``across`` is F₃₃ of plane strain."""
-    zero = (0.0, 0.0, 0.0)
-    F = zero, zero, (0.0, 0.0, across)
-    for a in range(CORNERS):
-        at, g = place[a], (gradients[3 * a], gradients[3 * a + 1], gradients[3 * a + 2])
-        u = np.float64(x[at]), np.float64(x[at + 1]), np.float64(x[at + 2])
-        F = (
-            combine(1.0, F[0], g[0], u),
-            combine(1.0, F[1], g[1], u),
-            combine(1.0, F[2], g[2], u),
-        )
-    return F
+@body
+def _pieces(arguments, low, high):
+    """Body that sums the stiffness of pieces low .. high."""
+    start, e, M = array(arguments, 0, np.int64), rows(arguments, 1, 9, np.float64), rows(arguments, 2, 81, np.float64)
+    weight, coarse = array(arguments, 3, np.float64), rows(arguments, 4, 24, np.float64)
+    out = rows(arguments, 5, 576, np.float64)
+    v = np.empty(216)
+    for c in range(low, high):
+        K = out[c]
+        K[:] = 0.0
+        for s in range(start[c], start[c + 1]):
+            _add(e[s], M[s], weight[s], coarse[s], v, K)
 
 
 @inline

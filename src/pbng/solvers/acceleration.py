@@ -6,13 +6,14 @@ are the leading, free part of a flat position array.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cache
+from typing import Any, Protocol
 
 import numpy as np
-from numba import prange
+from numba import uint64
 
 from pbng.errors import InputError
-from pbng.jit import kernel
+from pbng.parallel import array, body, each
 
 CHUNK = 4096  # entries a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
 
@@ -226,7 +227,9 @@ class MixingHistory:
         row = max(self.count, 0) % self.memory
         self.count += 1
         kept = min(self.count, self.memory)
-        sums = _difference(x, g, self.f, self.g, self.dF, self.dG, row, kept).sum(0)
+        part, sizes = np.empty((-(-len(x) // CHUNK), 2 * kept)), np.array([len(x), row, kept])
+        each(_difference(x.dtype), (x, g, self.f, self.g, self.dF, self.dG, part, sizes), len(part))
+        sums = part.sum(0)
         if first:
             return False
         self.gram[row, :kept] = self.gram[:kept, row] = sums[:kept]
@@ -237,7 +240,8 @@ class MixingHistory:
         """Write G(x) - ΔG θ to out, with θ the minimiser of |f - ΔF θ|; False if there is none."""
         theta = self._weights()
         if theta is not None:
-            _mix(g, self.dG, theta, out)
+            arrays = g, self.dG, out, theta, np.array([len(g), len(theta)])
+            each(_mix(g.dtype), arrays, -(-len(g) // CHUNK))
         return theta is not None
 
     def _weights(self) -> np.ndarray | None:
@@ -252,46 +256,61 @@ class MixingHistory:
         return scale * np.linalg.lstsq(A, scale * self.rhs[:n], rcond=1e-12)[0]
 
 
-@kernel
-def _difference(x, g, f_before, g_before, dF, dG, row, kept):
-    """Store the newest differences in ``row``; returns ΔF_row · ΔF_j, then ΔF_j · f, for j < kept, by chunks.
+@cache
+def _difference(dtype: np.dtype) -> Any:
+    """Body that stores the newest differences of chunks low .. high, and of each ΔF_row · ΔF_j, then ΔF_j · f."""
+    real = dtype.type
 
-    Slices, here and below, because Numba's test for negative indices keeps loops over two-index arrays scalar.
-    """
-    n = x.size
-    part = np.zeros(((n + CHUNK - 1) // CHUNK, 2 * kept))
-    for chunk in prange(part.shape[0]):
-        low, high = chunk * CHUNK, min(n, (chunk + 1) * CHUNK)
-        here, image, f, image_before = x[low:high], g[low:high], f_before[low:high], g_before[low:high]
-        df, dg = dF[row, low:high], dG[row, low:high]  # mean nothing on the first call: they are overwritten
-        for i in range(high - low):
-            step = image[i] - here[i]
-            df[i] = step - f[i]
-            f[i] = step
-        for i in range(high - low):
-            dg[i] = image[i] - image_before[i]
-            image_before[i] = image[i]
-        for j in range(kept):
-            other = dF[j, low:high]
-            a, b = 0.0, 0.0
-            for i in range(high - low):
-                a += df[i] * other[i]
-                b += other[i] * f[i]
-            part[chunk, j] = a
-            part[chunk, kept + j] = b
-    return part
+    @body
+    def difference(arguments, low, high):
+        x, g, f = array(arguments, 0, real), array(arguments, 1, real), array(arguments, 2, real)
+        before, dF, dG = array(arguments, 3, real), array(arguments, 4, real), array(arguments, 5, real)
+        out, sizes = array(arguments, 6, np.float64), array(arguments, 7, np.int64)
+        n, row, kept = sizes[0], uint64(sizes[1]), sizes[2]
+        for chunk in range(low, high):
+            first, m = uint64(chunk * CHUNK), min(n - chunk * CHUNK, CHUNK)
+            to = row * uint64(n) + first
+            for i_ in range(m):
+                i = uint64(i_)
+                step = g[first + i] - x[first + i]
+                dF[to + i] = step - f[first + i]  # means nothing on the first call: it is overwritten
+                f[first + i] = step
+            for i_ in range(m):
+                i = uint64(i_)
+                dG[to + i] = g[first + i] - before[first + i]
+                before[first + i] = g[first + i]
+            for j in range(kept):
+                other = uint64(j) * uint64(n) + first
+                a, b = 0.0, 0.0
+                for i_ in range(m):
+                    i = uint64(i_)
+                    a += dF[to + i] * dF[other + i]
+                    b += dF[other + i] * f[first + i]
+                out[2 * kept * chunk + j] = a
+                out[2 * kept * chunk + kept + j] = b
+
+    return difference
 
 
-@kernel
-def _mix(g, dG, theta, out):
-    """out = g - dGᵀ θ."""
-    n = g.size
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
-        low, high = chunk * CHUNK, min(n, (chunk + 1) * CHUNK)
-        mixed, image = out[low:high], g[low:high]
-        for i in range(high - low):
-            mixed[i] = image[i]
-        for j in range(theta.size):
-            t, dg = theta[j], dG[j, low:high]
-            for i in range(high - low):
-                mixed[i] -= t * dg[i]
+@cache
+def _mix(dtype: np.dtype) -> Any:
+    """Body of out = g - dGᵀ θ for chunks low .. high."""
+    real = dtype.type
+
+    @body
+    def mix(arguments, low, high):
+        g, dG, out = array(arguments, 0, real), array(arguments, 1, real), array(arguments, 2, real)
+        theta, sizes = array(arguments, 3, np.float64), array(arguments, 4, np.int64)
+        n, kept = sizes[0], sizes[1]
+        for chunk in range(low, high):
+            first, m = uint64(chunk * CHUNK), min(n - chunk * CHUNK, CHUNK)
+            for i_ in range(m):
+                i = first + uint64(i_)
+                out[i] = g[i]
+            for j in range(kept):
+                t, other = theta[j], uint64(j) * uint64(n)
+                for i_ in range(m):
+                    i = first + uint64(i_)
+                    out[i] -= t * dG[other + i]
+
+    return mix

@@ -1,7 +1,7 @@
 """Curves in the style of a paper, and the lettering of pictures; by matplotlib, with no state shared."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +16,25 @@ FAINT = "#dfe2e7"
 
 
 def plot_residuals(
-    series: Mapping[str, tuple[Any, Any]],
+    series: Mapping[str, tuple[Any, ...]],
     path: str | os.PathLike[str],
     xlabel: str = "iteration",
-    ylabel: str = "residual [N]",
+    ylabel: str | Sequence[str] = "residual [N]",
     title: str = "",
     *,
     log_x: bool = False,
+    top: float | None = None,
     size: tuple[float, float] = (5.2, 3.4),
 ) -> Path:
     """Plot curves on a logarithmic y axis, each labelled at its end; returns the path.
 
     Args:
         series: Label -> (x, y), of equal length. What is not finite, or not positive on a logarithmic axis, is left
-            out, and the curve is broken there.
+            out, and the curve is broken there. For panels side by side (x, y, y', ...); the labels are in the last.
         path: The .png, .pdf or .svg.
-        xlabel, ylabel, title: Words for the axes and above them.
+        xlabel, ylabel, title: Words for the axes and above them; of ``ylabel`` as many as there are panels.
         log_x: Whether the x axis is logarithmic too.
+        top: Where the y axes end at most; curves that rise further leave the panel.
         size: Width and height [inches]; a .png has 200 pixels an inch.
 
     Raises:
@@ -40,32 +42,32 @@ def plot_residuals(
     """
     if not series:
         raise InputError("no curves to plot")
-    curves = {}
-    for label, (x, y) in series.items():
-        x, y = np.asarray(x, float).ravel(), np.asarray(y, float).ravel()
-        if len(x) != len(y):
-            raise InputError(f"curve {label!r} has {len(x)} x and {len(y)} y")
-        shown = np.isfinite(x) & np.isfinite(y) & (y > 0) & ((x > 0) | (not log_x))
-        curves[label] = x, np.where(shown, y, np.nan)
-    figure, axes = _paper(size)
-    axes.set_yscale("log")
-    if log_x:
-        axes.set_xscale("log")
-    ends = []
-    for k, (label, (x, y)) in enumerate(curves.items()):
-        color = CURVES[k % len(CURVES)]
-        style = "-" if k < len(CURVES) else "--"
-        dots = "o" if np.isfinite(y).sum() < 2 else None
-        axes.plot(x, y, style, color=color, lw=1.6, marker=dots, ms=3.5, solid_capstyle="round", clip_on=False)
-        last = np.flatnonzero(np.isfinite(y))
-        if len(last):
-            ends.append((label, x[last[-1]], y[last[-1]], color))
-    axes.set_xlabel(xlabel)
-    axes.set_ylabel(ylabel)
-    if title:
-        axes.set_title(title, loc="left", fontsize=10, fontweight="bold", pad=10)
-    axes.margins(x=0.0)
-    _label_ends(figure, axes, ends)
+    words = (ylabel,) if isinstance(ylabel, str) else tuple(ylabel)
+    curves = {label: _curve(label, values, len(words), log_x) for label, values in series.items()}
+    figure, panels = _paper(size, len(words))
+    for p, axes in enumerate(panels):
+        axes.set_yscale("log")
+        if log_x:
+            axes.set_xscale("log")
+        ends = []
+        for k, (label, (x, *ys)) in enumerate(curves.items()):
+            y, color = ys[p], CURVES[k % len(CURVES)]
+            style = "-" if k < len(CURVES) else "--"
+            dots = "o" if np.isfinite(y).sum() < 2 else None
+            clip = top is not None
+            axes.plot(x, y, style, color=color, lw=1.6, marker=dots, ms=3.5, solid_capstyle="round", clip_on=clip)
+            last = np.flatnonzero(np.isfinite(y))
+            if len(last):
+                ends.append((label, x[last[-1]], min(y[last[-1]], top or np.inf), color))
+        if top is not None and axes.get_ylim()[1] > top:
+            low = min((np.nanmin(c[p + 1]) for c in curves.values() if np.isfinite(c[p + 1]).any()), default=top)
+            axes.set_ylim(low * min(low / top, 0.5) ** 0.05, top)
+        axes.set_xlabel(xlabel)
+        axes.set_ylabel(words[p])
+        axes.margins(x=0.0)
+        if title and p == 0:
+            axes.set_title(title, loc="left", fontsize=10, fontweight="bold", pad=10)
+    _label_ends(figure, panels[-1], ends)
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -158,21 +160,35 @@ def _apart(wanted: np.ndarray, gap: float) -> np.ndarray:
     return level + gap * np.arange(len(wanted))
 
 
-def _paper(size: tuple[float, float]) -> tuple[Any, Any]:
+def _curve(label: str, values: tuple[Any, ...], panels: int, log_x: bool) -> list[np.ndarray]:
+    """x and the y of every panel, NaN where there is nothing to draw."""
+    x, *ys = (np.asarray(v, float).ravel() for v in values)
+    if len(ys) != panels:
+        raise InputError(f"curve {label!r} has {len(ys)} y for {panels} panels")
+    for y in ys:
+        if len(x) != len(y):
+            raise InputError(f"curve {label!r} has {len(x)} x and {len(y)} y")
+    drawn = np.isfinite(x) & ((x > 0) | (not log_x))
+    return [x, *(np.where(drawn & np.isfinite(y) & (y > 0), y, np.nan) for y in ys)]
+
+
+def _paper(size: tuple[float, float], panels: int) -> tuple[Any, list[Any]]:
     figure = _figure(figsize=size, layout="constrained")
-    axes = figure.add_subplot()
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(INK)
-        spine.set_linewidth(0.8)
-    axes.grid(True, which="major", color=FAINT, lw=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(which="major", color=INK, labelcolor=INK, labelsize=9, length=3, width=0.8)
-    axes.tick_params(which="minor", length=0)
-    axes.xaxis.label.set(color=INK, fontsize=9.5)
-    axes.yaxis.label.set(color=INK, fontsize=9.5)
-    axes.title.set_color(INK)
-    return figure, axes
+    figure.get_layout_engine().set(w_pad=0.12 if panels > 1 else 0.04)
+    row = list(figure.subplots(1, panels, squeeze=False)[0])
+    for axes in row:
+        for side, spine in axes.spines.items():
+            spine.set_visible(side in ("left", "bottom"))
+            spine.set_color(INK)
+            spine.set_linewidth(0.8)
+        axes.grid(True, which="major", color=FAINT, lw=0.7)
+        axes.set_axisbelow(True)
+        axes.tick_params(which="major", color=INK, labelcolor=INK, labelsize=9, length=3, width=0.8)
+        axes.tick_params(which="minor", length=0)
+        axes.xaxis.label.set(color=INK, fontsize=9.5)
+        axes.yaxis.label.set(color=INK, fontsize=9.5)
+        axes.title.set_color(INK)
+    return figure, row
 
 
 def _page(size: tuple[int, int]) -> Any:
