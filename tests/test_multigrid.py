@@ -96,7 +96,7 @@ def test_budget_of_an_error():
     problem = twisted_block(12)
     result = pbng.solve(problem, budget=pbng.Budget(error=1e-4))
     assert result.status is pbng.Status.CONVERGED
-    assert result.error <= 1e-4
+    assert 3 * result.error <= 1e-4
     assert np.linalg.norm(result.x - reference(problem), axis=1).max() <= 1e-4
 
 

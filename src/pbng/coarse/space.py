@@ -57,9 +57,10 @@ class CoarseSpace:
         down = up.T.tocsr()
         self.restriction = down.indptr.astype(np.int64), down.indices.astype(np.int32), down.data
         stiffness, self.least = packed.stiffness(), []
+        least = 1e-6 * float(stiffness.mean()) if len(free) else 1.0  # for nodes that move no free vertex
         for level in range(len(self.grids)):
             held = LEAST * (up.multiply(up).T @ stiffness)
-            self.least.append(np.maximum(held, 1e-6 * stiffness.mean()))
+            self.least.append(np.maximum(held, least))
             if level < len(self.grids) - 1:
                 up = up @ self.solver.up[level]
         plane = np.array([b.mesh.cells.shape[1] == 3 for b in problem.bodies])

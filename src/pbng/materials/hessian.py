@@ -42,6 +42,8 @@ def hessians(model: Model, F: np.ndarray, numbers: np.ndarray, floor: np.ndarray
         e [Pa], (n, 9), and the modes M, (n, 9, 9), of which ``M[:, k, 3 * i + j]`` belongs to F_ij.
     """
     n, count = len(F), POINTS[model.isotropic]
+    if n == 0:
+        return np.empty((0, 9)), np.empty((0, 9, 9))
     n_block = -(-n * count // W)
     # Entries of W points side by side; what is not a point is rest.
     points, stress = np.empty((n_block, 9, W)), np.empty((n_block, 9, W))

@@ -23,7 +23,8 @@ class Budget:
         seconds: At most so many seconds [s], set-up and compilation excluded.
         rtol: Stop when the residual has fallen to this fraction of the first one.
         atol: Stop when the residual norm is below this [N].
-        error: Stop when the estimated position error is below this [m]; only methods that estimate it take it.
+        error: Stop when the position error is below this [m], that is when three times its estimate is; only for
+            methods that estimate it.
         every: Evaluate the residual every so many iterations; by default as often as suits the method's iterations.
     """
 

@@ -9,6 +9,8 @@ from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.solvers.base import Budget, History, Method, Monitor, Progress, Result, Status
 
+SAFETY = 3.0  # how much too low an estimate of the error may be
+
 
 def run(
     method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None = None, before: np.ndarray | None = None
@@ -87,7 +89,7 @@ def _verdict(history: History, tolerance: float, floor: float, error: float | No
     residual = history.last.residual
     if not (math.isfinite(residual) and math.isfinite(history.last.energy)):
         return Status.DIVERGED
-    if residual <= tolerance or residual == 0 or (error is not None and history.last.error <= error):
+    if residual <= tolerance or residual == 0 or (error is not None and SAFETY * history.last.error <= error):
         return Status.CONVERGED
     # Rounding is what is left once the residual is near its floor and has stopped falling.
     recent, before = history.residuals[-3:], history.residuals[:-3]

@@ -81,6 +81,7 @@ class TwoGrid(PackedMethod):
     """The cycle set up for one problem."""
 
     every = 1
+    first_trial = 3
     estimates_error = True
 
     def __init__(self, problem: Problem, solver: MultigridPBNG) -> None:
@@ -108,7 +109,7 @@ class TwoGrid(PackedMethod):
             lower = self.energy(self.packed.pack(extended)) < self.energy(self.packed.pack(x))
         return extended if lower else None
 
-    def start(self, x: np.ndarray) -> None:
+    def begin(self, x: np.ndarray) -> None:
         self.x = self.packed.pack(x)
         self.g, self.z = self.x.copy(), self.x.copy()
         self.history = MixingHistory(self.cycle.memory) if self.cycle.memory else None

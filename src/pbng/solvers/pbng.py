@@ -9,11 +9,11 @@ import numpy as np
 from pbng.assembly import ElementBlocks
 from pbng.errors import InputError
 from pbng.jit import compile_seconds
-from pbng.packing import pack_problem
+from pbng.packing import Packed, pack_problem
 from pbng.problem import Problem
 from pbng.solvers.acceleration import Acceleration, Anderson, Iteration, NodeSOR
 from pbng.solvers.base import Certificate
-from pbng.solvers.threads import Threads, check_threads
+from pbng.solvers.threads import FIRST_PROBE, Threads, check_threads
 from pbng.sweep import sweep
 
 
@@ -74,15 +74,17 @@ class PackedMethod:
     """PBNG set up for one problem: the packed layout, the float64 evaluation and an accelerated state."""
 
     every = 10
+    first_trial = FIRST_PROBE  # steps before another number of threads is tried
     estimates_error = False
 
     def __init__(self, problem: Problem, solver: PBNG) -> None:
         self.problem, self.solver = problem, solver
-        self.threads = Threads(solver.threads)
+        self.layouts: dict[str, Packed] = {}
+        self.threads = Threads(solver.threads, self.first_trial)
         start = time.perf_counter() - compile_seconds()
         with self.threads.used():
-            first = np.float32 if solver.dtype == "auto" else solver.dtype
-            self.packed = pack_problem(problem, np.dtype(first), solver.block == "paper")
+            first = "float32" if solver.dtype == "auto" else solver.dtype
+            self.packed = self.layout(first)
             X = problem.X - self.packed.origin
             self.blocks = ElementBlocks(problem.groups, X, self.packed.slot, self.packed.n_slot)
         forward = np.arange(len(self.packed.color_start) - 1)
@@ -99,16 +101,27 @@ class PackedMethod:
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
         return None
 
+    def start(self, x: np.ndarray) -> None:
+        self.packed = self.layout("float32" if self.solver.dtype == "auto" else self.solver.dtype)
+        self.begin(x)
+
     def refine(self) -> bool:
         if self.solver.dtype != "auto" or self.packed.dtype == np.float64:
             return False
         x = self.state()
         with self.threads.used():
-            self.packed = pack_problem(self.problem, np.dtype(np.float64), self.solver.block == "paper")
-        self.start(x)
+            self.packed = self.layout("float64")
+        self.begin(x)
         return True
 
-    def start(self, x: np.ndarray) -> None:
+    def layout(self, dtype: str) -> Packed:
+        """The problem packed in a precision; vertices have the same places in both."""
+        if dtype not in self.layouts:
+            self.layouts[dtype] = pack_problem(self.problem, np.dtype(dtype), self.solver.block == "paper")
+        return self.layouts[dtype]
+
+    def begin(self, x: np.ndarray) -> None:
+        """Take x (n_vert, 3) as the state, in the present precision, with no history."""
         self.x = self.packed.pack(x)
         acceleration: Acceleration = self.solver.acceleration
         self.iteration = acceleration.start(self)

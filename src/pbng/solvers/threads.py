@@ -27,12 +27,13 @@ class Threads:
     scheduler: two threads can then be ten times slower than one. Trials go up and down by factors of two.
     """
 
-    def __init__(self, fixed: int | None = None) -> None:
+    def __init__(self, fixed: int | None = None, first: int = FIRST_PROBE) -> None:
         self.most = numba.get_num_threads() if fixed is None else fixed
         self.adaptive = fixed is None and self.most > 1
         self.count = self.most
         self.seconds = 0.0  # of a recent step with that many
-        self.wait, self.every = 1, FIRST_PROBE
+        self.first = first  # steps before the first trial that follows a success
+        self.wait, self.every = 1, first
         self.up = False
 
     @contextmanager
@@ -67,7 +68,7 @@ class Threads:
             self.seconds = seconds
         else:
             better = seconds < GAIN * self.seconds
-            self.every = FIRST_PROBE if better else min(2 * self.every, LAST_PROBE)
+            self.every = self.first if better else min(2 * self.every, LAST_PROBE)
             self.wait = self.every
             if better:
                 self.count, self.seconds = count, seconds
