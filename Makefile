@@ -26,6 +26,9 @@ format: $(READY)
 bench: $(READY)
 	$(BIN)/pbng bench sweep
 	$(BIN)/pbng bench convergence
+	$(BIN)/pbng bench accuracy --out runs/bench
+	$(BIN)/pbng bench cycles
+	$(BIN)/pbng bench poses
 
 clean:
 	rm -rf .venv runs build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -18,6 +18,7 @@ COURSE = [
     ("06_from_a_surface", 1.0, 0.01, ["dragon.png"], ["igl", "pyvista"]),
     ("07_plane_strain", 1.0, 0.003, [], []),
     ("08_accelerations", 8.0, 3.5, ["residuals.png"], ["matplotlib"]),  # sweeps over sweeps
+    ("09_labels_to_trust", 1.0, 0.0, [], []),  # all of them
 ]
 
 
