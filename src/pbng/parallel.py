@@ -3,6 +3,9 @@
 Numba spends about as long on a parallel loop as on the code inside it. A *body* is therefore a serial function
 ``(arguments, low, high)`` that does the work of a range; the driver, compiled once and cached, calls it by its address.
 Arrays go as addresses too: :func:`array` and :func:`rows` make them arrays again inside the body.
+
+A body that is not made by :func:`pbng.dispatch.specialised` is cached by its own file alone: after a change of this
+file, of ``linalg`` or of ``spectral``, ``make clean`` removes what is stale.
 """
 
 from typing import Any

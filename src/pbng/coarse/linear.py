@@ -16,7 +16,8 @@ from pbng.parallel import array, body, each, rows
 
 # On few cores threads of BLAS only get in the way of Numba's, and their number would show in the last bits.
 _blas = ThreadpoolController()
-DENSE = 1300  # unknowns up to which the coarsest matrix is factorised as a dense one
+SHIFT = 1e-6  # of each diagonal block: few elements may leave directions of a piece free, or a whole body loose
+DENSE = 400  # unknowns up to which the coarsest matrix is factorised as a dense one
 
 
 class BlockMatrix:
@@ -134,10 +135,11 @@ def _gather(arguments, low, high):
 
 @serial
 def _invert_diagonal(diagonal, value, least, inverse):
-    """Raise diagonal blocks weaker than ``least`` and invert them."""
+    """Raise diagonal blocks, those weaker than ``least`` to it, and invert them."""
     for r in range(diagonal.size):
         a = value[diagonal[r]]
-        lift = max(0.0, least[r] - (a[0] + a[4] + a[8]) / 3)
+        mean = (a[0] + a[4] + a[8]) / 3
+        lift = max(SHIFT * mean, least[r] - mean)
         a[0] += lift
         a[4] += lift
         a[8] += lift

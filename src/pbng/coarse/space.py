@@ -78,7 +78,7 @@ class CoarseSpace:
         y = self.solver.solve(b, tolerance)
         y[:, 2] *= self.moves_z
         each(_prolong, (self.parents, self.weights, y, d), len(self.parents), grain=512)
-        return float(np.vdot(b, y))
+        return float((b * y).sum())
 
     def extend(self, increment: np.ndarray) -> np.ndarray:
         """Displacements (n_vert, 3) that extend those of the prescribed vertices (n_fixed, 3) over the grid."""

@@ -165,7 +165,14 @@ def _principal(U, S, V, p, h, floor, A, Q, e, M):
         else:  # the limit, which is right to second order in the difference
             flip = 0.5 * (A[m, m] + A[r, r]) - A[m, r]
         e[3 + pair] = max(flip, floor)
-        e[6 + pair] = max((p[0, m] + p[0, r]) / (total if abs(total) > 1e-9 else 1e-9), floor)
+        sum_ = p[0, m] + p[0, r]
+        if abs(total) > 1e-6 * (1.0 + abs(S[m])):
+            twist = sum_ / total
+        elif abs(sum_) <= 1e-5 * (abs(p[0, m]) + abs(p[0, r])):  # the limit again
+            twist = 0.5 * (A[m, m] + A[r, r]) + A[m, r]
+        else:  # a kink: without bound from below
+            twist = floor
+        e[6 + pair] = max(twist, floor)
         for i in range(3):
             for k in range(3):
                 u, v = math.sqrt(0.5) * U[i, m] * V[k, r], math.sqrt(0.5) * U[i, r] * V[k, m]
@@ -175,8 +182,8 @@ def _principal(U, S, V, p, h, floor, A, Q, e, M):
         e[n] = max(A[n, n], floor)
         for i in range(3):
             for k in range(3):
-                sum_ = Q[0, n] * U[i, 0] * V[k, 0] + Q[1, n] * U[i, 1] * V[k, 1] + Q[2, n] * U[i, 2] * V[k, 2]
-                M[n, 3 * i + k] = sum_
+                mode = Q[0, n] * U[i, 0] * V[k, 0] + Q[1, n] * U[i, 1] * V[k, 1] + Q[2, n] * U[i, 2] * V[k, 2]
+                M[n, 3 * i + k] = mode
 
 
 @serial
