@@ -649,8 +649,8 @@ def check_finite(problem, rng):
     assert np.isfinite(coarse.extend(rng.standard_normal((problem.fixed.sum(), 3)))).all()
 
 
-# Where the elements of a piece feel fewer directions than its corners have, or nothing holds a body, the sum over pieces
-# is singular; a shift makes it definite.
+# Where the elements of a piece feel fewer directions than its corners have, or nothing holds a body, the sum over
+# pieces is singular; a shift makes it definite.
 UNIT = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
 
 

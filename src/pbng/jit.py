@@ -29,7 +29,7 @@ sys.modules.setdefault("<dynamic>", types.ModuleType("<dynamic>"))
 
 # GNU OpenMP spins for long at the barrier behind every colour; on a core that other work wants, that costs a slice of
 # the scheduler each time. It reads this when the first parallel kernel runs.
-os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 # Reassociation and contraction let LLVM vectorise sums; NaN and infinity keep their meaning (no "nnan", "ninf").
 FLAGS: dict[str, Any] = {
