@@ -40,6 +40,7 @@ def run(
         tolerance = max(tolerance, method.floor(np.float64))  # a fraction of rounding cannot be asked for
     status = _verdict(history, tolerance, floor, budget.error)
     iteration, correction = 0, 0.0
+    seen = -1, x  # an iteration and the state after it
     if status is None and before is not None and (better := method.prepare(before, x)) is not None:
         method.start(better)
     try:
@@ -50,16 +51,21 @@ def run(
                 status = Status.SECONDS
             else:
                 due = (iteration + 1) % every == 0
-                before = method.state() if due or iteration + 1 == budget.cap else None
+                watched = due or iteration + 1 == budget.cap
+                if watched and seen[0] != iteration:
+                    with monitoring:
+                        seen = iteration, method.state()
                 method.step()
                 iteration += 1
-                if before is not None:
-                    correction = float(np.linalg.norm(method.state() - before, axis=1).max(initial=0.0))
+                if watched:
+                    with monitoring:
+                        was, seen = seen[1], (iteration, method.state())
+                        correction = float(np.linalg.norm(seen[1] - was, axis=1).max(initial=0.0))
                 if due:
                     certify(iteration)
                     status = _verdict(history, tolerance, floor, budget.error)
                     if status is Status.PRECISION and method.refine():
-                        status, floor = None, method.floor()
+                        status, floor, seen = None, method.floor(), (-1, x)
                     if monitor is not None:
                         monitor(_progress(history, tolerance, clock.seconds()))
     except KeyboardInterrupt:
