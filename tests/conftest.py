@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from grids import coarse_space, shaken
 from models import RootMooney, SoftVolume
 
 import pbng
+from pbng.coarse import space
 
 STARTS = ("scrambled", "mirrored", "plane", "line", "point")
 
@@ -76,3 +78,21 @@ def mixed_problem():
 @pytest.fixture(scope="session")
 def mixed():
     return mixed_problem()
+
+
+@pytest.fixture
+def small_bottom(monkeypatch):
+    """Grids are coarsened as far as they go, not only until a dense matrix is cheap."""
+    monkeypatch.setattr(space, "DENSE", 10)
+
+
+@pytest.fixture(scope="session")
+def tower():
+    """A box held at one side with grids of 64, 27 and 8 nodes, and the stiffness of a stretched and shaken state."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(space, "DENSE", 10)
+        problem = held_box(pbng.Corotated(E=1e5, nu=0.3), (12, 12, 12), (1.0, 1.0, 1.0))
+        coarse, packed = coarse_space(problem)
+    x = shaken(problem, 1.1, 0.01)
+    coarse.refresh(packed.pack(x))
+    return coarse, packed
