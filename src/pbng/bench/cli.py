@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -174,6 +175,42 @@ def cycles_command(
     write(record, "cycles", rows)
 
 
+@app.command("frames")
+def frames_command(
+    n: Annotated[int, typer.Option("--n", help="Vertices along an edge of the block.")] = 32,
+    frames: Annotated[int, typer.Option(help="Frames of the twisting block.", min=2)] = 30,
+    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
+    out: Annotated[Path | None, typer.Option(help="Folder for the figure.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+) -> None:
+    """Frames of the twisting block on small budgets: position error against cost."""
+    from pbng.bench import frames as bench
+
+    rows = bench.measure(n, frames, threads)
+    show(
+        f"Position error / size over {frames} frames, {n}³ vertices, corotated, {threads} threads, float32",
+        [
+            Column("a frame", "budget"),
+            Column("ms a frame", "ms", "{:.1f}"),
+            Column("median error", "median", "{:.1e}"),
+            Column("last error", "last", "{:.1e}"),
+        ],
+        rows,
+    )
+    write(record, "frames", rows)
+    if out is not None:
+        from pbng.view import plot_residuals
+
+        out.mkdir(parents=True, exist_ok=True)
+        plot_residuals(
+            {f"{r['budget']} ({r['ms']:.0f} ms)": (np.arange(1, frames), r["errors"][1:]) for r in rows},
+            out / f"frames_{n}.png",
+            xlabel="frame",
+            ylabel="largest position error / size",
+            title=f"Twisting block, {n}³ vertices",
+        )
+
+
 @app.command("poses")
 def poses_command(
     count: Annotated[int, typer.Option(help="Number of random poses.", min=1)] = 100,
@@ -183,12 +220,13 @@ def poses_command(
     nu: Annotated[float, typer.Option(help="Poisson's ratio.")] = 0.3,
     threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
     seed: int = 0,
+    amount: Annotated[float, typer.Option(help="How wild the poses are; 1 folds elements over in most.")] = 0.5,
     record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
 ) -> None:
     """Random poses of a bar, each solved to a position error: is the estimate to be trusted?"""
     from pbng.bench import poses
 
-    rows = poses.measure(count, n, error, model, nu, threads, seed)
+    rows = poses.measure(count, n, error, model, nu, threads, seed, amount)
     total = poses.summary(rows)
     show(
         f"A bar 2 x 1 x 1, {n} vertices across, {model}, ν = {nu}, error / length {error:g}, {threads} threads",

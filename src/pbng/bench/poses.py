@@ -18,12 +18,16 @@ SIZE = (2.0, 1.0, 1.0)
 Row = dict[str, Any]
 
 
-def random_pose(rng: np.random.Generator) -> Motion:
-    """Where the far end of the bar goes: twisted by ±120°, bent by ±60° about y and z, drawn to .8 .. 1.5 of the bar's
-    length and shifted by ±0.3 m along each axis."""
-    twist, bend = rng.uniform(-120, 120) / 360, rng.uniform(-60, 60, 2) / 360
-    shift = rng.uniform(-0.3, 0.3, 3)
-    shift[0] += (rng.uniform(0.8, 1.5) - 1) * SIZE[0]
+def random_pose(rng: np.random.Generator, amount: float = 0.5) -> Motion:
+    """Where the far end of the bar goes.
+
+    With amount 1 it is twisted by ±120°, turned about y and z by ±60°, drawn to 0.8 .. 1.5 of the bar's length and
+    shifted by ±0.3 m along each axis,
+    so that most poses fold elements over.
+    """
+    twist, bend = amount * rng.uniform(-120, 120) / 360, amount * rng.uniform(-60, 60, 2) / 360
+    shift = amount * rng.uniform(-0.3, 0.3, 3)
+    shift[0] += amount * (rng.uniform(0.8, 1.5) - 1) * SIZE[0]
     return Rotate("x", twist) + Rotate("y", bend[0]) + Rotate("z", bend[1]) + Translate(tuple(shift))
 
 
@@ -44,6 +48,7 @@ def measure(
     nu: float = 0.3,
     threads: int | None = None,
     seed: int = 0,
+    amount: float = 0.5,
 ) -> list[Row]:
     """One row a pose, each solved from rest to an estimated error of ``error`` times the length of the bar.
 
@@ -51,7 +56,7 @@ def measure(
     of it; ``true`` is NaN where the reference did not converge.
     """
     rng = np.random.default_rng(seed)
-    problem = bar(n, MODELS[model](E=1e5, nu=nu, density=10.0), [random_pose(rng) for _ in range(count)])
+    problem = bar(n, MODELS[model](E=1e5, nu=nu, density=10.0), [random_pose(rng, amount) for _ in range(count)])
     bound = error * SIZE[0]
     method = MultigridPBNG(threads=threads).set_up(problem)
     exact = MultigridPBNG(dtype="float64", start="previous", threads=threads).set_up(problem)
