@@ -29,6 +29,7 @@ bench: $(READY)
 	$(BIN)/pbng bench accuracy --out runs/bench
 	$(BIN)/pbng bench cycles
 	$(BIN)/pbng bench poses
+	$(BIN)/pbng bench frames --out runs/bench
 
 clean:
 	rm -rf .venv runs build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -131,3 +131,10 @@ def test_commands_print_and_record(tmp_path):
     assert result.exit_code == 0, result.output
     assert "two-grid" in result.output
     assert len(json.loads((tmp_path / "accuracy.json").read_text())["rows"]) == 6
+
+
+def test_a_cycle_a_frame_beats_sweeps():
+    """Frames of the twisting block: one cycle a frame ends nearer to equilibrium than six sweeps, two nearer still."""
+    rows = {row["budget"]: row for row in frames.measure(10, 8, threads=1)}
+    assert [len(row["errors"]) for row in rows.values()] == [8] * 4
+    assert rows["2 cycles"]["last"] < rows["1 cycle"]["last"] < rows["6 sweeps"]["last"]

@@ -177,7 +177,7 @@ def export(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
 )
 def bench(context: typer.Context) -> None:
-    """Measure: time of a sweep, convergence, accuracy, cycles, poses. See `pbng bench --help`."""
+    """Measure: time of a sweep, convergence, accuracy, cycles, poses, frames. See `pbng bench --help`."""
     try:
         from pbng.bench import app as benchmarks
     except ModuleNotFoundError as error:

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-app = typer.Typer(help="Measure: time of a sweep, convergence, accuracy, cycles, poses.", no_args_is_help=True)
+app = typer.Typer(help="Measure: time of a sweep, convergence, accuracy, cycles, poses, frames.", no_args_is_help=True)
 console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 170)  # tables are wide
 
 
