@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pbng
-from pbng.bench import accuracy, app, cycles, poses
+from pbng.bench import accuracy, app, cycles, frames, poses
 
 LEVELS = ("1e-02", "1e-03", "1e-04", "1e-06")
 
