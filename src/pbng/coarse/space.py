@@ -29,42 +29,32 @@ class CoarseSpace:
     """
 
     def __init__(self, problem: Problem, packed: Packed) -> None:
-        cells = [g.cells for g in problem.groups]
-        wide = max(c.shape[1] for c in cells)
-        cells_ = np.concatenate([np.concatenate([c, np.repeat(c[:, :1], wide - c.shape[1], 1)], 1) for c in cells])
-        body = np.repeat(np.arange(len(problem.bodies)), [b.stop - b.start for b in problem.bodies])
-        low, size = _cells(problem)
         self.problem = problem
-        self.grids: list[Grid] = [make_grid(problem.X, cells_, body, low, size)]
-        pieces = [self.grids[0].piece]
-        while 3 * self.grids[-1].n_node > DENSE:
-            next_grid = coarser(self.grids[-1], low, size)
-            if next_grid.n_node > 0.7 * self.grids[-1].n_node:
-                break
-            size = 2 * size
-            pieces.append(next_grid.piece[pieces[-1]])
-            self.grids.append(next_grid)
+        self.grids, pieces = _grids(problem)
         self.cubature = Cubature(problem, self.grids, pieces, packed.slot)
         self.solver = GridSolver(self.grids)
         free = np.flatnonzero(~problem.fixed)
-        place = packed.slot[free]
-        n = packed.n_free // 4
-        self.parents, self.weights = np.zeros((n, 8), np.int32), np.zeros((n, 8))
+        n, place = packed.n_free // 4, packed.slot[free]
+        self.parents, self.weights = np.zeros((n, 8), np.int32), np.zeros((n, 8))  # U, in the order of the blocks
         self.parents[place], self.weights[place] = self.grids[0].parents[free], self.grids[0].weights[free]
         row = np.repeat(np.arange(n), 8)
         up = scipy.sparse.csr_matrix((self.weights.ravel(), (row, self.parents.ravel())), (n, self.grids[0].n_node))
         up.eliminate_zeros()
         down = up.T.tocsr()
         self.restriction = down.indptr.astype(np.int64), down.indices.astype(np.int32), down.data
-        stiffness, self.least = packed.stiffness(), []
-        least = 1e-6 * float(stiffness.mean()) if len(free) else 1.0  # for nodes that move no free vertex
-        for level in range(len(self.grids)):
-            held = LEAST * (up.multiply(up).T @ stiffness)
-            self.least.append(np.maximum(held, least))
-            if level < len(self.grids) - 1:
-                up = up @ self.solver.up[level]
+        self.least = self._least(up, packed.stiffness())
         plane = np.array([b.mesh.cells.shape[1] == 3 for b in problem.bodies])
         self.moves_z = ~plane[self.grids[0].body]
+
+    def _least(self, up: scipy.sparse.csr_matrix, stiffness: np.ndarray) -> list[np.ndarray]:
+        """For each grid the least stiffness of its nodes (n_node,) [N/m], from that of the vertices that they move."""
+        least = []
+        nothing = 1e-6 * float(stiffness.mean()) if len(stiffness) else 1.0  # for nodes that move no free vertex
+        for level in range(len(self.grids)):
+            least.append(np.maximum(LEAST * (up.multiply(up).T @ stiffness), nothing))
+            if level < len(self.grids) - 1:
+                up = up @ self.solver.up[level]
+        return least
 
     def refresh(self, x: np.ndarray) -> None:
         """Take the stiffness at a flat position array."""
@@ -98,6 +88,26 @@ class CoarseSpace:
         scale = laplacian.diagonal().mean()
         tied = laplacian + 1e-9 * scale * scipy.sparse.identity(grid.n_node) + TIE * scale * (at_fixed.T @ at_fixed)
         return up, scipy.sparse.linalg.splu(tied.tocsc()), at_fixed * (TIE * scale)
+
+
+def _grids(problem: Problem) -> tuple[list[Grid], list[np.ndarray]]:
+    """Grids from fine to coarse, and for each the piece of every element, in the order of the problem's groups."""
+    corners = max(g.cells.shape[1] for g in problem.groups)
+    cells = [
+        np.concatenate([c, np.repeat(c[:, :1], corners - c.shape[1], 1)], 1) for c in (g.cells for g in problem.groups)
+    ]
+    body = np.repeat(np.arange(len(problem.bodies)), [b.stop - b.start for b in problem.bodies])
+    low, size = _cells(problem)
+    grids = [make_grid(problem.X, np.concatenate(cells), body, low, size)]
+    pieces = [grids[0].piece]
+    while 3 * grids[-1].n_node > DENSE:
+        grid = coarser(grids[-1], low, size)
+        if grid.n_node > 0.7 * grids[-1].n_node:  # many small bodies
+            break
+        size = 2 * size
+        pieces.append(grid.piece[pieces[-1]])
+        grids.append(grid)
+    return grids, pieces
 
 
 def _cells(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
