@@ -59,9 +59,7 @@ def demo(path: Path, resolution: int) -> None:
             (pictures["strip"], "the same in one picture, coloured by its stretch"),
             (pictures["residuals"], "how far each frame was from equilibrium, before and after"),
         ]
-    look.append(
-        (_compare(path / "accelerations.png"), "why Anderson is the default: residuals of one hard equilibrium")
-    )
+    look.append((_compare(path / "accelerations.png"), "why PBNG mixes its sweeps: residuals of one hard equilibrium"))
     out.print(f"[bold]Look at[/] (made in {time.perf_counter() - start:.0f} s):")
     for file, words in look:
         out.print(f"  {escape(str(file))}  [dim]{words}[/]", soft_wrap=True)
