@@ -8,6 +8,7 @@ A body that is not made by :func:`pbng.dispatch.specialised` is cached by its ow
 file, of ``linalg`` or of ``spectral``, ``make clean`` removes what is stale.
 """
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ def each(body: Any, arrays: tuple[np.ndarray, ...], n: int, grain: int = 1) -> N
     run(body, arrays, np.array([0]), np.array([0, n]), grain)
 
 
+@cache
 def _address(body: Any) -> int:
     compiled = body.overloads.get(_SIGNATURE)
     if compiled is None:

@@ -14,6 +14,7 @@ from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.solvers.acceleration import SOR, Anderson, Chebyshev, NodeSOR
 from pbng.solvers.base import Budget, Method, Solver, Status
+from pbng.solvers.loop import at_floor
 from pbng.solvers.multigrid import MultigridPBNG
 from pbng.solvers.pbng import PBNG
 
@@ -133,7 +134,7 @@ def _watch(method: Method, reference: np.ndarray, limit: float) -> Curve:
         residuals.append(method.certify().residual)
         errors.append(float(np.linalg.norm(method.state() - reference, axis=1).max() / size))
         now = seconds[-1]
-        if now >= limit or not np.isfinite(residuals[-1]) or _at_floor(residuals, floor):
+        if now >= limit or not np.isfinite(residuals[-1]) or at_floor(residuals, floor):
             break
         due = moments[moments > now][0]
         while now < due:
@@ -141,11 +142,6 @@ def _watch(method: Method, reference: np.ndarray, limit: float) -> Curve:
             iterations += 1
         seconds.append(now)
     return Curve(np.array(seconds), np.array(residuals) / first, np.array(errors), iterations)
-
-
-def _at_floor(residuals: list[float], floor: float) -> bool:
-    recent, before = residuals[-3:], residuals[:-3]
-    return bool(before) and recent[-1] < 4 * floor and min(recent) > 0.9 * min(before)
 
 
 def _timed(call: Callable[[], Any]) -> float:

@@ -79,7 +79,7 @@ def convergence_command(
                 results = convergence.measure(m, name, v, sweeps, every, dtype)
                 for acceleration, r in results.items():
                     row: dict[str, Any] = {"n": m, "model": name, "nu": v, "acceleration": acceleration}
-                    row |= {f"{level:.0e}": convergence.sweeps_to(r, level) for level in convergence.LEVELS}
+                    row |= {f"{level:.0e}": convergence.iterations_to(r, level) for level in convergence.LEVELS}
                     row |= {"last": r.reduction, "ms": r.seconds_per_iteration * 1e3, "status": r.status.name}
                     row["ratios"] = convergence.ratios(r).tolist()
                     rows.append(row)

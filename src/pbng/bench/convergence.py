@@ -35,7 +35,7 @@ def ratios(result: Result) -> np.ndarray:
     return result.residuals / result.residuals[0]
 
 
-def sweeps_to(result: Result, level: float) -> int | None:
+def iterations_to(result: Result, level: float) -> int | None:
     """The first monitored iteration at which the ratio is below a level, or None."""
     met = np.flatnonzero(ratios(result) <= level)
     return int(result.monitored[met[0]]) if len(met) else None

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-import numpy as np
-
+from pbng.bench.convergence import LEVELS, iterations_to, ratios
 from pbng.bench.scenes import MODELS, box, hard_start
 from pbng.bench.timing import peak_memory
 from pbng.drivers import solve
@@ -11,7 +10,6 @@ from pbng.solvers.base import Budget, Result
 from pbng.solvers.loop import run
 from pbng.solvers.multigrid import MultigridPBNG
 
-LEVELS = (1e-2, 1e-3, 1e-4, 1e-6)
 TIMED = (1e-3, 1e-6)
 WARM_UP = 4  # cycles before the clock runs
 
@@ -28,20 +26,14 @@ def measure(n: int, model: str, nu: float, dtype: str, threads: int | None) -> d
     run(method, x, Budget(iterations=WARM_UP), before=problem.X)
     result = run(method, x, Budget(rtol=min(LEVELS), iterations=60, every=1), before=problem.X)
     row: dict[str, Any] = {"n": n, "model": model, "nu": nu, "tets": problem.n_elem}
-    row |= {f"{level:.0e}": cycles_to(result, level) for level in LEVELS}
+    row |= {f"{level:.0e}": iterations_to(result, level) for level in LEVELS}
     row |= {f"s {level:.0e}": seconds_to(result, level) for level in TIMED}
     row |= {"ms": result.seconds_per_iteration * 1e3, "setup_s": setup, "peak_MB": peak_memory() / 1e6}
     row |= {"last": result.reduction, "inverted": result.inverted, "status": result.status.name}
-    return row | {"ratios": (result.residuals / result.residuals[0]).tolist()}
-
-
-def cycles_to(result: Result, level: float) -> int | None:
-    """The first cycle after which the residual over the first one is below a level, or None."""
-    met = np.flatnonzero(result.residuals <= level * result.residuals[0])
-    return int(result.monitored[met[0]]) if len(met) else None
+    return row | {"ratios": ratios(result).tolist()}
 
 
 def seconds_to(result: Result, level: float) -> float | None:
     """Their share of the time of the solve [s], monitoring excluded."""
-    cycles = cycles_to(result, level)
+    cycles = iterations_to(result, level)
     return None if cycles is None else cycles * result.seconds_per_iteration

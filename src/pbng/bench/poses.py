@@ -22,8 +22,7 @@ def random_pose(rng: np.random.Generator, amount: float = 0.5) -> Motion:
     """Where the far end of the bar goes.
 
     With amount 1 it is twisted by ±120°, turned about y and z by ±60°, drawn to 0.8 .. 1.5 of the bar's length and
-    shifted by ±0.3 m along each axis,
-    so that most poses fold elements over.
+    shifted by ±0.3 m along each axis, so that most poses fold elements over.
     """
     twist, bend = amount * rng.uniform(-120, 120) / 360, amount * rng.uniform(-60, 60, 2) / 360
     shift = amount * rng.uniform(-0.3, 0.3, 3)

@@ -159,7 +159,6 @@ class _Mixing:
         self.energy = math.inf  # at the last checked state
         self.unchecked = 0  # steps since
         self.good = 0  # checks passed in a row
-        self.rejected = 0
         self.history = MixingHistory(memory)
         self.buffers: tuple[np.ndarray, ...] = ()
 
@@ -202,7 +201,7 @@ class _Mixing:
 
     def _restart(self) -> None:
         self.history.restart()
-        self.good, self.unchecked, self.rejected = 0, 0, self.rejected + 1
+        self.good, self.unchecked = 0, 0
 
 
 class MixingHistory:

@@ -97,13 +97,15 @@ def _verdict(history: History, tolerance: float, floor: float, error: float | No
         return Status.DIVERGED
     if residual <= tolerance or residual == 0 or (error is not None and SAFETY * history.last.error <= error):
         return Status.CONVERGED
-    # Rounding is what is left once the residual is near its floor and has stopped falling.
-    recent, before = history.residuals[-3:], history.residuals[:-3]
-    if not before and residual <= floor and len(history.residuals) == 1:
-        return Status.PRECISION
-    if before and residual < 4 * floor and min(recent) > 0.9 * min(before):
+    if (len(history.residuals) == 1 and residual <= floor) or at_floor(history.residuals, floor):
         return Status.PRECISION
     return None
+
+
+def at_floor(residuals: list[float], floor: float) -> bool:
+    """Whether rounding is what is left: the residual is near its floor and has stopped falling."""
+    recent, before = residuals[-3:], residuals[:-3]
+    return bool(before) and recent[-1] < 4 * floor and min(recent) > 0.9 * min(before)
 
 
 def _progress(history: History, tolerance: float, seconds: float) -> Progress:

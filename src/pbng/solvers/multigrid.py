@@ -132,7 +132,7 @@ class TwoGrid(PackedMethod):
         n, g, z = self.n_free, self.g, self.z
         g[:] = self.x
         self.apply(g, self.cycle.omega)
-        f = self._force(g)
+        f, _, _ = self.free_forces(g)
         if not np.isfinite(f).all():  # the loop will say so
             z[:], self.Ez = g, math.nan
             return
@@ -166,19 +166,13 @@ class TwoGrid(PackedMethod):
             history.restart()
         self.x, self.z, self.E = self.z, self.x, self.Ez
 
-    def _force(self, x: np.ndarray) -> np.ndarray:
-        self.blocks.forces(x, self.forces)
-        return self.forces[: self.n_free] + self.f_ext[: self.n_free]
-
     def _noise(self, x: np.ndarray) -> float:
         """What rounding may do to an energy [J]."""
-        unit = 0.5 * np.finfo(x.dtype).eps * float(np.abs(x).max(initial=0.0))
-        return self.total_stiffness * unit**2 + 1e-13 * abs(self.E)
+        return self.total_stiffness * self.rounding(x) ** 2 + 1e-13 * abs(self.E)
 
     def certify(self) -> Certificate:
         with self.threads.used():
-            force_scale, inverted = self.blocks.forces(self.x, self.forces)
-            f = self.forces[: self.n_free] + self.f_ext[: self.n_free]
+            f, force_scale, inverted = self.free_forces(self.x)
             return Certificate(float(np.linalg.norm(f)), self.E, force_scale, inverted, self._error(f))
 
     def _error(self, f: np.ndarray) -> float:

@@ -147,14 +147,21 @@ class PackedMethod:
 
     def certify(self) -> Certificate:
         with self.threads.used():
-            force_scale, inverted = self.blocks.forces(self.x, self.forces)
-            total = self.forces[: self.n_free] + self.f_ext[: self.n_free]
-            return Certificate(float(np.linalg.norm(total)), self.energy(self.x), force_scale, inverted)
+            f, force_scale, inverted = self.free_forces(self.x)
+            return Certificate(float(np.linalg.norm(f)), self.energy(self.x), force_scale, inverted)
+
+    def free_forces(self, x: np.ndarray) -> tuple[np.ndarray, float, int]:
+        """Total forces on the free vertices [N], flat, with the force scale [N] and the number of inverted elements."""
+        force_scale, inverted = self.blocks.forces(x, self.forces)
+        return self.forces[: self.n_free] + self.f_ext[: self.n_free], force_scale, inverted
 
     def floor(self, dtype: Any = None) -> float:
         """Norm of the forces that moving each node by half a unit in the last place of the largest position makes."""
-        unit = 0.5 * np.finfo(dtype or self.x.dtype).eps * float(np.abs(self.x).max(initial=0.0))
-        return unit * float(np.linalg.norm(self.packed.stiffness()))
+        return self.rounding(self.x, dtype) * float(np.linalg.norm(self.packed.stiffness()))
+
+    def rounding(self, x: np.ndarray, dtype: Any = None) -> float:
+        """Half a unit in the last place of the largest position [m], in a precision, by default that of x."""
+        return 0.5 * float(np.finfo(dtype or x.dtype).eps) * float(np.abs(x).max(initial=0.0))
 
     def _work(self, x: np.ndarray) -> float:
         """Work [J] of the external forces since rest."""
