@@ -113,9 +113,13 @@ class GridSolver:
 
 def interpolation(grid: Grid) -> scipy.sparse.csr_matrix:
     """Weights (n, n_node) of a grid's nodes at the vertices of what it was made for."""
-    n = len(grid.parents)
-    row = np.repeat(np.arange(n), 8)
-    matrix = scipy.sparse.csr_matrix((grid.weights.ravel(), (row, grid.parents.ravel())), (n, grid.n_node))
+    return weight_matrix(grid.parents, grid.weights, grid.n_node)
+
+
+def weight_matrix(parents: np.ndarray, weights: np.ndarray, n_node: int) -> scipy.sparse.csr_matrix:
+    """The matrix (n, n_node) of parents and weights (n, 8), without zeros."""
+    row = np.repeat(np.arange(len(parents)), 8)
+    matrix = scipy.sparse.csr_matrix((weights.ravel(), (row, parents.ravel())), (len(parents), n_node))
     matrix.eliminate_zeros()
     return matrix
 

@@ -8,7 +8,7 @@ import scipy.sparse.linalg
 from numba import uint64
 
 from pbng.coarse.grid import CORNERS, Grid, coarser, make_grid
-from pbng.coarse.linear import DENSE, GridSolver, interpolation
+from pbng.coarse.linear import DENSE, GridSolver, interpolation, weight_matrix
 from pbng.coarse.stiffness import Cubature
 from pbng.packing import Packed
 from pbng.parallel import array, body, each, rows
@@ -37,9 +37,7 @@ class CoarseSpace:
         n, place = packed.n_free // 4, packed.slot[free]
         self.parents, self.weights = np.zeros((n, 8), np.int32), np.zeros((n, 8))  # U, in the order of the blocks
         self.parents[place], self.weights[place] = self.grids[0].parents[free], self.grids[0].weights[free]
-        row = np.repeat(np.arange(n), 8)
-        up = scipy.sparse.csr_matrix((self.weights.ravel(), (row, self.parents.ravel())), (n, self.grids[0].n_node))
-        up.eliminate_zeros()
+        up = weight_matrix(self.parents, self.weights, self.grids[0].n_node)
         down = up.T.tocsr()
         self.restriction = down.indptr.astype(np.int64), down.indices.astype(np.int32), down.data
         self.least = self._least(up, packed.stiffness())
