@@ -103,7 +103,8 @@ def _frames(
 
 def _equilibrium(method: Method, x: np.ndarray, t: float, budget: Budget, monitor: Monitor | None) -> Result:
     """The equilibrium at time t, from the state x before the prescribed vertices moved to where they then belong."""
-    return run(method, method.problem.constrain(x, t), budget, monitor, before=x)
+    problem = method.problem
+    return run(method, problem.constrain(x, t), budget, monitor, before=x, targets=problem.targets(t))
 
 
 def _timed(method: Method, result: Result) -> Result:

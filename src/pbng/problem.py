@@ -1,7 +1,7 @@
 """The discrete problem: frozen arrays, and its energy and forces in float64 (Eqs. 11-17)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from pbng.assembly import ElementBlocks
 from pbng.coloring import color_nodes, morton
+from pbng.constraints import WeakConstraints, WeakEnergy
 from pbng.elements.base import ElementKind, Term
 from pbng.errors import InputError
 from pbng.materials.base import Block, Material, model_of
@@ -59,6 +60,11 @@ class Problem:
         f_ext: External forces [N], (n_vert, 3).
         mass: Lumped masses [kg], (n_vert,).
         end: Time [s] at which every motion has ended.
+        weak: Weak constraints, by size of their stencils.
+        dt: Time step [s] of a problem of backward Euler (:meth:`dynamic`), else None.
+
+    What evaluates something takes ``targets`` (n_target, 3) [m], the points in space that weak constraints end at,
+    by default those at the end of every motion.
     """
 
     name: str
@@ -70,6 +76,8 @@ class Problem:
     f_ext: np.ndarray
     mass: np.ndarray
     end: float = 0.0
+    weak: tuple[WeakConstraints, ...] = ()
+    dt: float | None = None
 
     @property
     def n_vert(self) -> int:
@@ -79,23 +87,68 @@ class Problem:
     def n_elem(self) -> int:
         return sum(len(g.cells) for g in self.groups)
 
-    def energy(self, x: np.ndarray) -> float:
+    @property
+    def n_target(self) -> int:
+        """Number of points in space that weak constraints, inertia included, end at."""
+        return sum(len(w.vertices) for w in self.weak if w.anchored)
+
+    def targets(self, t: float) -> np.ndarray:
+        """Those of the weak constraints at time t [s], (k, 3) [m]; the targets of inertia are not functions of time."""
+        places = [w.targets(t) for w in self.weak[: None if self.dt is None else -1] if w.targets]
+        return np.concatenate([np.empty((0, 3)), *places])
+
+    def dynamic(self, dt: float) -> "Problem":
+        """The problem of one step of backward Euler: the incremental potential adds ½ m/Δt² |x - x̂|² for each vertex.
+
+        Its targets are those of this problem followed by the x̂ of the free vertices, (n_free, 3).
+
+        Raises:
+            InputError: dt is not positive and finite, or a free vertex has no mass.
+        """
+        if not (np.isfinite(dt) and dt > 0):
+            raise InputError(f"dt must be positive and finite, not {dt}")
+        free = np.flatnonzero(~self.fixed)
+        if len(free) == 0:
+            return replace(self, dt=float(dt), weak=(*self.weak,))
+        light = free[self.mass[free] <= 0]
+        if len(light):
+            raise InputError(f"inertia: vertex {light[0]} has no mass; give its material a density")
+        K = (self.mass[free] / dt**2)[:, None, None] * np.eye(3)
+        inertia = WeakConstraints(free[:, None].astype(np.int32), np.ones((len(free), 1)), K, _passed)
+        return replace(self, dt=float(dt), weak=(*self.weak, inertia))
+
+    def energy(self, x: np.ndarray, targets: np.ndarray | None = None) -> float:
         """Potential energy [J] at x (n_vert, 3), Eq. (17), zero at rest: elastic, less the work of external forces."""
-        return self._blocks.energy(self._flat(x)) - float(np.sum(self.f_ext * (np.asarray(x, float) - self.X)))
+        energy = self._blocks.energy(self._flat(x)) - float(np.sum(self.f_ext * (np.asarray(x, float) - self.X)))
+        return energy + self.weak_energy.energy(x, self._targets(targets)) if self.weak_energy else energy
 
-    def forces(self, x: np.ndarray) -> np.ndarray:
+    def forces(self, x: np.ndarray, targets: np.ndarray | None = None) -> np.ndarray:
         """Internal force [N] on every vertex at x, -∂PE/∂x of Eq. (13), (n_vert, 3); external forces not included."""
-        f = np.empty(4 * self.n_vert)
-        self._blocks.forces(self._flat(x), f)
-        return f.reshape(-1, 4)[:, :3]
+        return self.evaluate(x, targets)[0]
 
-    def residual(self, x: np.ndarray) -> float:
+    def evaluate(self, x: np.ndarray, targets: np.ndarray | None = None) -> tuple[np.ndarray, float, int]:
+        """Internal forces as :meth:`forces`, the sum of the norms of all elements' [N], and inverted elements."""
+        f = np.empty(4 * self.n_vert)
+        force_scale, inverted = self._blocks.forces(self._flat(x), f)
+        f = f.reshape(-1, 4)[:, :3]
+        if self.weak_energy:
+            weak, scale = self.weak_energy.forces(np.asarray(x, float), self._targets(targets))
+            return f + weak, force_scale + scale, inverted
+        return f, force_scale, inverted
+
+    def residual(self, x: np.ndarray, targets: np.ndarray | None = None) -> float:
         """Norm [N] of internal plus external force over the free vertices, Eq. (11), in float64."""
-        return float(np.linalg.norm((self.forces(x) + self.f_ext)[~self.fixed]))
+        return float(np.linalg.norm((self.forces(x, targets) + self.f_ext)[~self.fixed]))
 
     def inverted(self, x: np.ndarray) -> int:
         """Number of elements with det F < 0."""
         return self._blocks.forces(self._flat(x), np.empty(4 * self.n_vert))[1]
+
+    def _targets(self, targets: np.ndarray | None) -> np.ndarray:
+        found = self.targets(self.end) if targets is None else np.asarray(targets, float)
+        if found.shape != (self.n_target, 3):
+            raise InputError(f"targets must have shape {(self.n_target, 3)}, not {found.shape}")
+        return found
 
     def constrain(self, x: np.ndarray, t: float) -> np.ndarray:
         """A copy of x (n_vert, 3) with the prescribed vertices where they belong at time t [s]."""
@@ -136,6 +189,11 @@ class Problem:
         return np.argsort(morton(self.X), kind="stable")
 
     @cached_property
+    def weak_energy(self) -> WeakEnergy | None:
+        """Energy and forces of the weak constraints, if there are any."""
+        return WeakEnergy(self.weak, self.n_vert) if self.weak else None
+
+    @cached_property
     def _blocks(self) -> ElementBlocks:
         return ElementBlocks(self.groups, self.X)
 
@@ -146,3 +204,7 @@ class Problem:
         flat = np.zeros((self.n_vert, 4))
         flat[:, :3] = x
         return flat.ravel()
+
+
+def _passed(t: float) -> np.ndarray:
+    raise InputError("the targets of inertia are not functions of time: pass them")

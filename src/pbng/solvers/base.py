@@ -184,8 +184,11 @@ class Method(Protocol):
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
         """A better state to start from than x (n_vert, 3), which is ``before`` with prescribed vertices moved."""
 
-    def start(self, x: np.ndarray) -> None:
-        """Take x (n_vert, 3) as the state, with the prescribed vertices where they belong."""
+    def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
+        """Take x (n_vert, 3) as the state, with the prescribed vertices where they belong.
+
+        ``targets`` (n_target, 3) are those of the problem's weak constraints, by default at the end of every motion.
+        """
 
     def step(self) -> None:
         """One iteration."""

@@ -13,19 +13,24 @@ SAFETY = 3.0  # how much too low an estimate of the error may be
 
 
 def run(
-    method: Method, x: np.ndarray, budget: Budget, monitor: Monitor | None = None, before: np.ndarray | None = None
+    method: Method,
+    x: np.ndarray,
+    budget: Budget,
+    monitor: Monitor | None = None,
+    before: np.ndarray | None = None,
+    targets: np.ndarray | None = None,
 ) -> Result:
     """Iterate from x (n_vert, 3), whose prescribed vertices are in place, until the budget says stop.
 
     The first residual is that of x. If ``before`` is x with the prescribed vertices where they were until now, the
     method may then begin at a better state, which it makes from the movement. The clock leaves out compilation. Ctrl-C
-    ends the loop with the last state computed.
+    ends the loop with the last state computed. ``targets`` are those of the problem's weak constraints (n_target, 3).
     """
     if budget.error is not None and not method.estimates_error:
         raise InputError(f"Budget(error={budget.error}): this method has no estimate of the error; use MultigridPBNG")
     every = budget.every or method.every
     clock, monitoring = _Clock(), _Clock(running=False)
-    method.start(x)
+    method.start(x, targets)
     history = History()
 
     def certify(iteration: int) -> None:
@@ -42,7 +47,7 @@ def run(
     iteration, correction = 0, 0.0
     seen = -1, x  # an iteration and the state after it
     if status is None and before is not None and (better := method.prepare(before, x)) is not None:
-        method.start(better)
+        method.start(better, targets)
     try:
         while status is None:
             if iteration >= budget.cap:

@@ -101,7 +101,8 @@ class PackedMethod:
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
         return None
 
-    def start(self, x: np.ndarray) -> None:
+    def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
+        self.targets = self.problem.targets(self.problem.end) if targets is None else targets
         self.packed = self.layout("float32" if self.solver.dtype == "auto" else self.solver.dtype)
         self.begin(x)
 

@@ -1,0 +1,141 @@
+"""Weak constraints: springs of no length between interpolated points, Eqs. (18)-(19), and their energy and forces.
+
+With C = Σ_j w0_j x_j - Σ_j w1_j x_j the energy is ½ Cᵀ K C. Both sides' weights are kept as one list with signs; a side
+that is a point in space, fixed or moving, is a *target*. Backward Euler's inertia has the same form: each vertex is
+bound to where it would fly, with K = m/Δt² I.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+
+from pbng.errors import InputError
+
+ROUNDING = 1e-9  # what weights may sum to that should sum to zero
+
+
+@dataclass(frozen=True, eq=False)
+class WeakConstraints:
+    """Weak constraints with stencils of one size.
+
+    Args:
+        vertices: Vertices of each stencil, (m, s) int32, none twice in a row.
+        weights: Their weights w0 - w1, (m, s).
+        K: Stiffness matrices [N/m], symmetric and positive semidefinite, (m, 3, 3).
+        targets: ``t -> (m, 3)`` [m]: points that take the place of the second side; None if that has vertices too.
+
+    Raises:
+        InputError: Shapes do not fit, a number is not finite, weights do not sum to zero (to one with targets), a
+            vertex stands twice in a stencil, or a K is not symmetric or has a negative eigenvalue.
+    """
+
+    vertices: np.ndarray
+    weights: np.ndarray
+    K: np.ndarray
+    targets: Callable[[float], np.ndarray] | None = None
+
+    def __post_init__(self) -> None:
+        m = len(self.vertices)
+        if self.vertices.ndim != 2 or m == 0 or self.weights.shape != self.vertices.shape:
+            raise InputError(
+                f"weak constraints: vertices and weights must have one shape (m, s), not {self.vertices.shape} and"
+                f" {self.weights.shape}"
+            )
+        if self.K.shape != (m, 3, 3):
+            raise InputError(f"weak constraints: K must have shape {(m, 3, 3)}, not {self.K.shape}")
+        for name in ("weights", "K"):
+            bad = np.flatnonzero(~np.isfinite(getattr(self, name).reshape(m, -1)).all(1))
+            if len(bad):
+                raise InputError(f"weak constraint {bad[0]}: {name} is not finite")
+        wanted = 1.0 if self.targets else 0.0
+        bad = np.flatnonzero(np.abs(self.weights.sum(1) - wanted) > ROUNDING)
+        if len(bad):
+            side = "to a point" if self.targets else "between two sides"
+            raise InputError(
+                f"weak constraint {bad[0]} {side}: weights sum to {self.weights[bad[0]].sum():.9g}, not {wanted:g}"
+            )
+        ordered = np.sort(self.vertices, axis=1)
+        bad = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(1))
+        if len(bad):
+            raise InputError(f"weak constraint {bad[0]}: a vertex stands twice in {self.vertices[bad[0]].tolist()}")
+        scale = np.abs(self.K).max(axis=(1, 2))
+        bad = np.flatnonzero(
+            (np.abs(self.K - self.K.transpose(0, 2, 1)).max(axis=(1, 2)) > ROUNDING * scale)
+            | (np.linalg.eigvalsh(self.K)[:, 0] < -ROUNDING * scale)
+        )
+        if len(bad):
+            raise InputError(f"weak constraint {bad[0]}: K must be symmetric without negative eigenvalues")
+
+    @property
+    def anchored(self) -> bool:
+        """Whether the second side is a point in space."""
+        return self.targets is not None
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether every K is a multiple of the unit matrix."""
+        return bool((self.K[:, :1, :1] * np.eye(3) == self.K).all())
+
+
+class WeakEnergy:
+    """Energy, forces and Hessian of weak constraints in float64, for any numbering of the vertices.
+
+    Args:
+        constraints: The constraints; at least one.
+        n: Length of the position arrays.
+        slot: Number in them of each vertex; by default its own.
+    """
+
+    def __init__(self, constraints: Sequence[WeakConstraints], n: int, slot: np.ndarray | None = None) -> None:
+        row, column, weight, first, anchored = [], [], [], 0, []
+        for c in constraints:
+            m, s = c.vertices.shape
+            row.append(np.repeat(np.arange(first, first + m), s))
+            column.append((c.vertices if slot is None else slot[c.vertices]).ravel())
+            weight.append(c.weights.ravel())
+            if c.anchored:
+                anchored.append(np.arange(first, first + m))
+            first += m
+        entries = np.concatenate(weight), (np.concatenate(row), np.concatenate(column))
+        self.weights = scipy.sparse.csr_matrix(entries, (first, n))
+        self.K = np.concatenate([c.K for c in constraints])
+        self.anchored = np.concatenate(anchored) if anchored else np.empty(0, int)
+
+    def gaps(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """C (m, 3) [m] at x (n, 3), with targets (n_target, 3)."""
+        C = self.weights @ x
+        C[self.anchored] -= targets
+        return C
+
+    def energy(self, x: np.ndarray, targets: np.ndarray) -> float:
+        """½ Σ Cᵀ K C [J]."""
+        C = self.gaps(x, targets)
+        return 0.5 * float(np.einsum("mi,mij,mj->", C, self.K, C, optimize=True))
+
+    def forces(self, x: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, float]:
+        """Forces (n, 3) [N], Eq. (31), and the sum of the norms of all constraints' forces [N]."""
+        pull = np.einsum("mij,mj->mi", self.K, self.gaps(x, targets))
+        return -(self._spread @ pull), float((np.linalg.norm(pull, axis=1) * self._reach).sum())
+
+    @cached_property
+    def _spread(self) -> scipy.sparse.csr_matrix:
+        return self.weights.T.tocsr()
+
+    @cached_property
+    def _reach(self) -> np.ndarray:
+        """Norm (m,) of each constraint's weights."""
+        return np.sqrt(np.asarray(self.weights.multiply(self.weights).sum(1)).ravel())
+
+    def hessian(self, U: scipy.sparse.csr_matrix | None = None) -> scipy.sparse.bsr_matrix:
+        """Hessian [N/m] in blocks of 3x3, (3 n, 3 n), or U'HU for interpolation weights U (n, k): it is constant."""
+        W = (self.weights if U is None else self.weights @ U).tocsr()
+        W.sort_indices()
+        m, n = W.shape
+        wide = scipy.sparse.bsr_matrix(
+            (W.data[:, None, None] * np.eye(3), W.indices, W.indptr), shape=(3 * m, 3 * n), blocksize=(3, 3)
+        )
+        K = scipy.sparse.bsr_matrix((self.K, np.arange(m), np.arange(m + 1)), shape=(3 * m, 3 * m), blocksize=(3, 3))
+        return (wide.T.tobsr((3, 3)) @ (K @ wide)).tobsr((3, 3))
