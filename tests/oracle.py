@@ -37,6 +37,14 @@ def sweep(problem, x, nodes, omega=1.0, paper=False):
                 c = g if at_rest else np.einsum("nij,nj->ni", cof(F), g)
                 f -= np.einsum("n,nij,nj->i", v, oracle_stress(group.material, F), g)
                 A += a * (v * (g * g).sum(1)).sum() * np.eye(3) + b * np.einsum("n,ni,nj->ij", v, c, c)
+        target = 0
+        for w in problem.weak:
+            points = problem.targets(problem.end)[target:][: len(w.vertices)] if w.anchored else np.zeros((len(w.K), 3))
+            target += len(points) * w.anchored
+            for e, corner in zip(*np.nonzero(w.vertices == i)):
+                C = w.weights[e] @ x[w.vertices[e]] - points[e]
+                f -= w.weights[e, corner] * w.K[e] @ C
+                A += w.weights[e, corner] ** 2 * w.K[e]
         x[i] += omega * np.linalg.solve(A, f)
     return x
 

@@ -70,14 +70,14 @@ class WeakConstraints:
             raise InputError(f"weak constraint {bad[0]}: K must be symmetric without negative eigenvalues")
 
     @property
+    def corners(self) -> int:
+        """Vertices of each stencil."""
+        return self.vertices.shape[1]
+
+    @property
     def anchored(self) -> bool:
         """Whether the second side is a point in space."""
         return self.targets is not None
-
-    @property
-    def isotropic(self) -> bool:
-        """Whether every K is a multiple of the unit matrix."""
-        return bool((self.K[:, :1, :1] * np.eye(3) == self.K).all())
 
 
 class WeakEnergy:
@@ -132,10 +132,20 @@ class WeakEnergy:
     def hessian(self, U: scipy.sparse.csr_matrix | None = None) -> scipy.sparse.bsr_matrix:
         """Hessian [N/m] in blocks of 3x3, (3 n, 3 n), or U'HU for interpolation weights U (n, k): it is constant."""
         W = (self.weights if U is None else self.weights @ U).tocsr()
-        W.sort_indices()
-        m, n = W.shape
-        wide = scipy.sparse.bsr_matrix(
-            (W.data[:, None, None] * np.eye(3), W.indices, W.indptr), shape=(3 * m, 3 * n), blocksize=(3, 3)
-        )
-        K = scipy.sparse.bsr_matrix((self.K, np.arange(m), np.arange(m + 1)), shape=(3 * m, 3 * m), blocksize=(3, 3))
-        return (wide.T.tobsr((3, 3)) @ (K @ wide)).tobsr((3, 3))
+        k, unit = self.K[:, 0, 0], np.eye(3)
+        same = (self.K == k[:, None, None] * unit).all((1, 2))  # the same in all directions: numbers for blocks will do
+        A = W[same]
+        total = _blocks(A.T @ scipy.sparse.diags(k[same]) @ A, unit)
+        if not same.all():
+            B = _blocks(W[~same], unit)
+            m = B.shape[0] // 3
+            K = scipy.sparse.bsr_matrix((self.K[~same], np.arange(m), np.arange(m + 1)), shape=(3 * m, 3 * m))
+            total = total + B.T.tobsr((3, 3)) @ (K @ B)
+        return total.tobsr((3, 3))
+
+
+def _blocks(matrix: scipy.sparse.csr_matrix, block: np.ndarray) -> scipy.sparse.bsr_matrix:
+    """A matrix whose entries are each multiplied with a block (3, 3)."""
+    matrix = matrix.tocsr()
+    shape = 3 * matrix.shape[0], 3 * matrix.shape[1]
+    return scipy.sparse.bsr_matrix((matrix.data[:, None, None] * block, matrix.indices, matrix.indptr), shape=shape)

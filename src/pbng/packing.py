@@ -3,19 +3,21 @@
 Free vertices are renumbered: by colour, inside a colour by the groups they touch, along a Morton curve, and in windows
 by falling valence; 16 consecutive ones form a block. A *row* holds one incidence for each lane of a block; the rows of
 a block that belong to one element group form a *segment*. Lanes that run out of incidences repeat one with weight
-zero. Prescribed vertices come after all blocks.
+zero. Prescribed vertices come after all blocks, and the targets of weak constraints after them.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 
 from pbng.assembly import group_parameters
+from pbng.constraints import WeakConstraints
 from pbng.dispatch import call, specialised
+from pbng.elements import weak
 from pbng.elements.base import W
-from pbng.jit import FLAGS, inline, serial
-from pbng.problem import Problem
+from pbng.jit import inline, serial
+from pbng.parallel import array, body, each, rows
+from pbng.problem import Coupling, Problem
 
 NODAL = 9  # numbers a node: external force (3), constant part of its Hessian (6, upper triangle)
 WINDOW = 512  # nodes within which valence is sorted: enough to fill blocks evenly, few enough to keep locality
@@ -35,6 +37,10 @@ class Packed:
         idx, coef: The rows: places of the other corners in a flat position array, and coefficients; flat, lane fastest.
         nodal: External force and constant Hessian of the nodes, flat (n_block, NODAL, W).
         parameters: Numbers of the groups' materials, flat.
+        functions: What sweeps the segments of each term.
+        stiffness: Constant part of each node's elastic stiffness [N/m], a third of its Hessian's trace, (n_block * W,).
+        weak_stiffness: The same of weak constraints.
+        n_target: Number of targets, the last slots.
     """
 
     slot: np.ndarray
@@ -48,7 +54,10 @@ class Packed:
     coef: np.ndarray
     nodal: np.ndarray
     parameters: np.ndarray
-    terms: tuple
+    functions: tuple
+    stiffness: np.ndarray
+    weak_stiffness: np.ndarray
+    n_target: int
 
     @property
     def dtype(self) -> np.dtype:
@@ -64,18 +73,14 @@ class Packed:
         """Memory [bytes] of the layout."""
         return sum(a.nbytes for a in (self.seg, self.idx, self.coef, self.nodal, self.slot))
 
-    def stiffness(self) -> np.ndarray:
-        """Constant part of each node's stiffness [N/m], a third of its Hessian's trace, (n_block * W,)."""
-        nodal = self.nodal.reshape(-1, NODAL, W)
-        real = np.zeros((self.n_block, W), bool)
-        real.ravel()[self.slot[self.slot < self.n_block * W]] = True
-        return np.where(real, nodal[:, 3] + nodal[:, 6] + nodal[:, 8], 0.0).ravel() / 3
-
-    def pack(self, x: np.ndarray) -> np.ndarray:
-        """Positions (n_vert, 3) as the flat array (4 n_slot,) that kernels read."""
+    def pack(self, x: np.ndarray, targets: np.ndarray | None = None) -> np.ndarray:
+        """Positions (n_vert, 3) and targets (n_target, 3) as the flat array (4 n_slot,) that kernels read."""
         out = aligned(4 * self.n_slot, self.dtype)
         out[:] = 0
-        out.reshape(-1, 4)[self.slot, :3] = x - self.origin if self.origin.any() else x
+        places = out.reshape(-1, 4)[:, :3]
+        places[self.slot] = x - self.origin if self.origin.any() else x
+        if targets is not None and len(targets):
+            places[self.n_slot - self.n_target :] = targets - self.origin
         return out
 
     def unpack(self, x: np.ndarray) -> np.ndarray:
@@ -103,49 +108,80 @@ def pack_problem(problem: Problem, dtype=np.float32, paper_block: bool = False) 
     slot[rest] = len(node) + np.arange(len(rest))
     owner = np.where(real, node, np.repeat(node[::W], W))  # padding lanes repeat the first of their block
 
-    terms = tuple(dict.fromkeys(g.term for g in problem.groups))
-    parameters, first = group_parameters(problem.groups, dtype, paper_block)
-    frames = [(g.kind, g.term.model.isotropic) for g in problem.groups]
-    packers = tuple(dict.fromkeys(kind.pack(isotropic) for kind, isotropic in frames))
-    # For each group: term, parameters, indices a row, coefficients a row, packer.
-    table = np.array(
-        [
-            (terms.index(g.term), p, W * kind.others, W * kind.width(iso), packers.index(kind.pack(iso)))
-            for g, p, (kind, iso) in zip(problem.groups, first, frames)
-        ]
-    )
-    blocks = [g.block(paper_block) for g in problem.groups]
-    numbers = np.array([(b.a, b.b, b.b if b.at_rest else 0.0) for b in blocks])
-
+    n_target, n_slot = problem.n_target, len(node) + len(rest) + problem.n_target
+    places = np.concatenate([slot, np.arange(n_slot - n_target, n_slot)])
+    parameters, table, numbers, functions = _terms(problem, dtype, paper_block)
+    spans, n_idx, n_coef = _layout(problem, owner, table)
+    idx, coef = aligned(n_idx, np.uint32), aligned(n_coef, dtype)
     nodal = np.zeros((n_block, NODAL, W))
     nodal[:, :3] = problem.f_ext[owner].reshape(n_block, W, 3).transpose(0, 2, 1) * real.reshape(n_block, 1, W)
-    kinds = list(problem.incidences)
-    sizes, spans = [], []
-    idx_at = coef_at = 0
-    for kind in kinds:
-        cells, group, start, incident = problem.incidences[kind]
-        seg_start, seg = _segments(owner, start, incident, group, kind.corners, table)
-        seg[:, 3] += idx_at
-        seg[:, 4] += coef_at
-        if len(seg):
-            idx_at = int(seg[-1, 3] + seg[-1, 2] * table[seg[-1, 5], 2])
-            coef_at = int(seg[-1, 4] + seg[-1, 2] * table[seg[-1, 5], 3])
-        spans.append((seg_start, seg))
-        sizes.append(len(seg))
-    idx, coef = aligned(idx_at, np.uint32), aligned(coef_at, dtype)
-    fill = specialised(make_fill, packers)
-    for kind, (seg_start, seg) in zip(kinds, spans):
-        cells, group, start, incident = problem.incidences[kind]
-        fill(
-            owner, real, slot, problem.X.ravel(), seg_start, seg, cells, group, start, incident, kind.opposite,
-            table, numbers, idx, coef, nodal.reshape(-1),
-        )  # fmt: skip
+    stiffness = []
+    for weakly in (False, True):
+        for coupling, (seg_start, seg) in zip(problem.couplings, spans):
+            if isinstance(coupling.source, WeakConstraints) == weakly:
+                _fill(problem, coupling, owner, real, places, seg_start, seg, table, numbers, idx, coef, nodal)
+        stiffness.append((nodal[:, 3] + nodal[:, 6] + nodal[:, 8]).ravel() / 3)
     seg_start, seg = spans[0] if len(spans) == 1 else _merge(spans)
     seg = seg[:, :5].copy()
     return Packed(
-        slot, _origin(problem.X), len(node) + len(rest), n_block, color_start, seg_start, seg, idx, coef,
-        _padded(nodal, real).astype(dtype).ravel(), parameters, terms,
+        slot, _origin(problem.X), n_slot, n_block, color_start, seg_start, seg, idx, coef,
+        _padded(nodal, real).astype(dtype).ravel(), parameters, functions, stiffness[0], stiffness[1] - stiffness[0],
+        n_target,
     )  # fmt: skip
+
+
+def _terms(problem: Problem, dtype, paper_block: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple]:
+    """The numbers kernels read, a table of all groups with the weak ones, the numbers of their blocks, and what sweeps.
+
+    Columns of the table: term, place of the parameters, indices a row, coefficients a row.
+    """
+    terms = list(dict.fromkeys(g.term for g in problem.groups))
+    parameters, first = group_parameters(problem.groups, dtype, paper_block)
+    table = [
+        (terms.index(g.term), p, W * g.kind.others, W * g.kind.width(g.term.model.isotropic))
+        for g, p in zip(problem.groups, first)
+    ]
+    others = [w.corners - 1 + w.anchored for w in problem.weak]
+    for n, count in enumerate(others):
+        table.append((len(terms), len(parameters) + n, W * count, W * weak.width(count)))
+    blocks = [g.block(paper_block) for g in problem.groups]
+    numbers = [(b.a, b.b, b.b if b.at_rest else 0.0) for b in blocks] + [(0.0, 0.0, 0.0)] * len(others)
+    functions = tuple(t.kind.sweep(t.model) for t in terms) + ((weak.sweep,) if others else ())
+    return np.concatenate([parameters, np.array(others, dtype)]), np.array(table), np.array(numbers), functions
+
+
+def _layout(problem: Problem, owner: np.ndarray, table: np.ndarray) -> tuple[list, int, int]:
+    """For each coupling the segments as :func:`_segments` gives them, and the lengths of ``idx`` and ``coef``."""
+    spans = []
+    n_idx = n_coef = 0
+    for c in problem.couplings:
+        seg_start, seg = _segments(owner, c.start, c.incident, c.group, c.corners, table)
+        seg[:, 3] += n_idx
+        seg[:, 4] += n_coef
+        if len(seg):
+            n_idx = int(seg[-1, 3] + seg[-1, 2] * table[seg[-1, 5], 2])
+            n_coef = int(seg[-1, 4] + seg[-1, 2] * table[seg[-1, 5], 3])
+        spans.append((seg_start, seg))
+    return spans, n_idx, n_coef
+
+
+def _fill(problem, c: Coupling, owner, real, places, seg_start, seg, table, numbers, idx, coef, nodal) -> None:
+    """Write the rows of a coupling, and add what is constant of its Hessians to ``nodal``."""
+    if isinstance(c.source, WeakConstraints):
+        opposite = weak.opposite(c.corners, c.source.anchored)
+        data = weak.weak_data(c.source.weights, c.source.K, c.source.anchored)
+        packers, packer = (weak.pack,), np.zeros(len(table), np.int64)
+    else:
+        opposite, data, kind = c.source.opposite, np.zeros((1, 1)), c.source
+        own = [kind.pack(g.term.model.isotropic) for g in problem.groups]
+        packers = tuple(dict.fromkeys(p for p, g in zip(own, problem.groups) if g.kind is kind))
+        packer = np.array([packers.index(p) if p in packers else 0 for p in own])
+    sizes = np.array([c.corners, opposite.shape[1], c.cells.shape[1], data.shape[1]])
+    arrays = (
+        owner, real, places, problem.X, seg_start, seg, np.ascontiguousarray(c.cells), c.group, c.start, c.incident,
+        np.ascontiguousarray(opposite), table, packer, numbers, data, idx, coef, nodal, sizes,
+    )  # fmt: skip
+    each(specialised(make_fill, packers, coef.dtype), arrays, len(seg_start) - 1, grain=64)
 
 
 def _origin(X: np.ndarray) -> np.ndarray:
@@ -160,18 +196,18 @@ def _numbering(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     color = problem.color
     valence = np.zeros(problem.n_vert, np.int64)
     touched = np.zeros(problem.n_vert, np.int64)  # a hash of the groups a vertex touches
-    for n, g in enumerate(problem.groups):
-        mine = np.bincount(g.cells.ravel(), minlength=problem.n_vert)
+    for n, cells in enumerate([g.cells for g in problem.groups] + [w.vertices for w in problem.weak]):
+        mine = np.bincount(cells.ravel(), minlength=problem.n_vert)
         valence += mine
         touched += (mine > 0) * (1 << min(n, 62))
-    order = problem.order
+    order, several = problem.order, len(problem.groups) + len(problem.weak) > 1
     node, color_start = [], [0]
     for c in range(color.max() + 1 if len(color) else 0):
         mine = order[color[order] == c]
-        if len(problem.groups) > 1:
+        if several:
             mine = mine[np.argsort(touched[mine], kind="stable")]
         window = np.arange(len(mine)) // WINDOW
-        mine = mine[np.lexsort((-valence[mine], touched[mine] if len(problem.groups) > 1 else window, window))]
+        mine = mine[np.lexsort((-valence[mine], touched[mine] if several else window, window))]
         node.append(np.concatenate([mine, np.full(-len(mine) % W, -1)]))
         color_start.append(color_start[-1] + len(node[-1]) // W)
     return np.array(color_start), np.concatenate(node) if node else np.empty(0, np.int64)
@@ -237,15 +273,24 @@ def _segments(owner, start, incident, group, corners, table):
     return seg_start, seg
 
 
-def make_fill(key: str):
-    """Kernel that writes the rows of one element kind."""
+def make_fill(key: str, dtype: np.dtype):
+    """Body that writes the rows of one coupling for blocks low .. high."""
+    real_type = dtype.type
 
-    @njit(parallel=True, cache=True, **FLAGS)
-    def fill(
-        owner, real, slot, X, seg_start, seg, cells, group, start, incident, opposite, table, numbers, idx, coef, nodal
-    ):
-        corners, others = cells.shape[1], opposite.shape[1]
-        for b in prange(seg_start.size - 1):
+    @body
+    def fill(arguments, low, high):
+        sizes = array(arguments, 18, np.int64)
+        corners, others = sizes[0], sizes[1]
+        owner, real = array(arguments, 0, np.int64), array(arguments, 1, np.bool_)
+        places, X = array(arguments, 2, np.int64), array(arguments, 3, np.float64)
+        seg_start, seg = array(arguments, 4, np.int64), rows(arguments, 5, 6, np.int64)
+        cells, group = rows(arguments, 6, sizes[2], np.int32), array(arguments, 7, np.int32)
+        start, incident = array(arguments, 8, np.int64), array(arguments, 9, np.int32)
+        opposite, table = rows(arguments, 10, others, np.int64), rows(arguments, 11, 4, np.int64)
+        packer, numbers = array(arguments, 12, np.int64), rows(arguments, 13, 3, np.float64)
+        data, idx = rows(arguments, 14, sizes[3], np.float64), array(arguments, 15, np.uint32)
+        coef, nodal = array(arguments, 16, real_type), array(arguments, 17, np.float64)
+        for b in range(low, high):
             for lane in range(W):
                 place = W * b + lane
                 v = owner[place]
@@ -266,10 +311,11 @@ def make_fill(key: str):
                         )
                         e, a = q // corners, q % corners
                         for j in range(others):
-                            idx[i + W * j] = 4 * slot[cells[e, opposite[a, j]]]
+                            idx[i + W * j] = 4 * places[cells[e, opposite[a, j]]]
                         once = 1.0 if row < n and real[place] else 0.0
                         at = (NODAL * b + 3) * W + lane
-                        call(key, table[which, 4], (X, cells, e, a, opposite, once, coef, c, numbers[which], nodal, at))
+                        block = numbers[which]
+                        call(key, packer[which], (X, cells, e, a, opposite, once, coef, c, block, data, nodal, at))
                         i += table[which, 2]
                         c += table[which, 3]
                     k = end

@@ -34,6 +34,7 @@ def run(body: Any, arrays: tuple[np.ndarray, ...], sets: np.ndarray, start: np.n
         sets, start: Which ranges; nothing may be written that another call of the same range reads or writes.
         grain: Length of the pieces of a range that are given to threads.
     """
+    assert all(a.flags.c_contiguous for a in arrays), "arrays of parallel bodies must be contiguous"
     _run(_address(body), np.array([a.__array_interface__["data"][0] for a in arrays]), sets, start, grain)
 
 

@@ -47,6 +47,30 @@ class BodyRange:
 
 
 @dataclass(frozen=True, eq=False)
+class Coupling:
+    """Elements of one kind, or weak constraints with stencils of one size, and at which vertices they meet.
+
+    Attributes:
+        source: The element kind, or the weak constraints.
+        cells: The vertices of each, (m, k); those of weak constraints are followed by the number of their target, if
+            they have one: targets are numbered on from the vertices.
+        group: Group of each, (m,): element groups first, then ``weak``.
+        start, incident: As of :func:`pbng.topology.incidence`, over the vertices alone.
+    """
+
+    source: ElementKind | WeakConstraints
+    cells: np.ndarray
+    group: np.ndarray
+    start: np.ndarray
+    incident: np.ndarray
+
+    @property
+    def corners(self) -> int:
+        """Vertices of each."""
+        return self.source.corners
+
+
+@dataclass(frozen=True, eq=False)
 class Problem:
     """Everything a solver needs, and nothing of the scene it came from.
 
@@ -159,20 +183,29 @@ class Problem:
 
     @cached_property
     def component(self) -> np.ndarray:
-        """Label (n_vert,) of the connected part each vertex belongs to."""
-        edges = np.concatenate([g.cells[:, [0, k]] for g in self.groups for k in range(1, g.cells.shape[1])])
+        """Label (n_vert,) of the part that each vertex belongs to, connected by elements or weak constraints."""
+        cells = [g.cells for g in self.groups] + [w.vertices for w in self.weak]
+        edges = np.concatenate([c[:, [0, k]] for c in cells for k in range(1, c.shape[1])])
         return components(edges, self.n_vert)
 
     @cached_property
-    def incidences(self) -> dict[ElementKind, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """For each element kind: its cells, the group of each, and the vertex-to-cell incidence (start, incident)."""
-        out = {}
+    def couplings(self) -> tuple["Coupling", ...]:
+        """What couples vertices: first the elements, by kind, then the weak constraints, by size of their stencils."""
+        out = []
         for kind in dict.fromkeys(g.kind for g in self.groups):
             mine = [(n, g) for n, g in enumerate(self.groups) if g.kind is kind]
             cells = np.concatenate([g.cells for _, g in mine])
             group = np.concatenate([np.full(len(g.cells), n, np.int32) for n, g in mine])
-            out[kind] = (cells, group, *incidence(cells, self.n_vert))
-        return out
+            out.append(Coupling(kind, cells, group, *incidence(cells, self.n_vert)))
+        target = self.n_vert
+        for n, w in enumerate(self.weak, len(self.groups)):
+            start, incident = incidence(w.vertices, self.n_vert)
+            cells = w.vertices
+            if w.anchored:
+                cells = np.column_stack([cells, np.arange(target, target + len(cells), dtype=np.int32)])
+                target += len(cells)
+            out.append(Coupling(w, cells, np.full(len(cells), n, np.int32), start, incident))
+        return tuple(out)
 
     @cached_property
     def color(self) -> np.ndarray:
@@ -180,7 +213,7 @@ class Problem:
         order = self.order
         return color_nodes(
             order[~self.fixed[order]],
-            [(s, i, kind.corners, len(c)) for kind, (c, _, s, i) in self.incidences.items()],
+            [(c.start, c.incident, c.corners, len(c.cells)) for c in self.couplings if c.corners > 1],
         )
 
     @cached_property

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pbng.bindings import Binding, bind, weak_constraints
+from pbng.bodies import Body, Points, Selection
 from pbng.elements.base import ElementKind
 from pbng.elements.simplex import PLANE_TRIANGLE, TET
 from pbng.errors import InputError
@@ -17,39 +19,6 @@ from pbng.motions import Motion, as_motion
 from pbng.problem import BodyRange, ElementGroup, Problem
 
 log = logging.getLogger("pbng")
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """A mesh with its material or materials, as part of a scene."""
-
-    name: str
-    mesh: Mesh
-    materials: tuple[tuple[Material, np.ndarray], ...]  # with the cells each holds for
-    start: int  # number of its first vertex in the scene
-
-    def where(self, *which: Any, **conditions: Any) -> "Selection":
-        """Vertices of this body, chosen as by :meth:`pbng.mesh.Mesh.where`."""
-        words = [repr(w) if isinstance(w, str) else type(w).__name__ for w in which]
-        words += [f"{k}={v}" for k, v in conditions.items()]
-        return Selection(self, self.mesh.where(*which, **conditions), ", ".join(words))
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """Vertices (k,) of a body, and the words that chose them."""
-
-    body: Body
-    vertices: np.ndarray
-    words: str
-
-    def __len__(self) -> int:
-        return len(self.vertices)
-
-    @property
-    def index(self) -> np.ndarray:
-        """Their numbers in the scene, (k,)."""
-        return self.body.start + self.vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +45,7 @@ class Scene:
         self.bodies: list[Body] = []
         self._moves: list[_Move] = []
         self._forces: list[tuple[np.ndarray, np.ndarray]] = []
+        self._bindings: list[Binding] = []
 
     def add(
         self, mesh: Mesh, material: Material | Mapping[str, Material], name: str | None = None, at: Any = None
@@ -124,8 +94,7 @@ class Scene:
         Raises:
             InputError: The selection is empty, or shares only some vertices with that of an earlier pin or move.
         """
-        if not (math.isfinite(over) and over >= 0 and math.isfinite(start) and start >= 0):
-            raise InputError(f"move: over and start must be finite and not negative, not {over} and {start}")
+        _check_times("move", over, start)
         self._moves.append(_Move(self._checked("move", selection), as_motion(motion), start, over))
 
     def force(self, selection: Selection, force: Sequence[float]) -> None:
@@ -139,11 +108,7 @@ class Scene:
         Per rest area and of fixed direction. In the plane the boundary's edges take the place of triangles [N/m].
         """
         index = self._checked("traction", selection)
-        mesh, start = selection.body.mesh, selection.body.start
-        chosen = np.zeros(mesh.n_vert, bool)
-        chosen[selection.vertices] = True
-        faces = mesh.boundary_edges if isinstance(mesh, TriMesh) else mesh.surface
-        faces = faces[chosen[faces].all(1)]
+        mesh, start, faces = selection.body.mesh, selection.body.start, selection.faces
         if len(faces) == 0:
             raise InputError(f"traction on {selection.words}: no whole face of the surface is selected")
         if faces.shape[1] == 3:
@@ -154,11 +119,57 @@ class Scene:
         np.add.at(share, faces, (measure / faces.shape[1])[:, None])
         self._forces.append((index, np.outer(share[index - start], np.array(_vector("traction", traction)))))
 
+    def bind(
+        self,
+        a: Selection | Points,
+        b: Any,
+        k: Any = None,
+        *,
+        k_n: Any = None,
+        k_tau: Any = 0.0,
+        normal: Any = None,
+        over: float = 0.0,
+        start: float = 0.0,
+    ) -> None:
+        """Tie points to points by springs without length: weak constraints, Eqs. (18)-(19).
+
+        The stiffness is k, the same in all directions, or k_n along a normal and k_tau across it.
+
+        Args:
+            a: The points: selected vertices, or :meth:`Body.points`.
+            b: What they are tied to: as many points of a body; a body, or a selection of its vertices, for the closest
+                point of its faces at rest (of those that are wholly selected; of the vertices if none is); positions
+                [m], (m, 3) or (3,); or a motion as :meth:`move` takes it, of the points a.
+            k: Stiffness [N/m] of each spring, a number or (m,).
+            k_n, k_tau: Stiffness along and across the normal [N/m], numbers or (m,).
+            normal: Directions (m, 3) or (3,), fixed in space; by default the closest face's outward normal at rest.
+            over, start: Of a motion [s], as for :meth:`move`.
+
+        Raises:
+            InputError: There is nothing to tie, sizes differ, weights do not sum to one, or a stiffness is negative or
+                not finite.
+        """
+        points = self._checked_points("bind", a)
+        other: Any = b
+        if isinstance(b, Body | Selection | Points):
+            self._checked_points("bind", b.where(...) if isinstance(b, Body) else b)
+        elif isinstance(b, Motion) or callable(b):
+            _check_times("bind", over, start)
+            move, X = _Move(np.arange(len(points)), as_motion(b), start, over), points.X
+            other = _Prescribed(X, [move])
+        self._bindings.append(bind(points, other, k, k_n, k_tau, normal))
+
+    def _checked_points(self, what: str, points: Any) -> Points:
+        if isinstance(points, Points):
+            self._check_body(what, points.body)
+            return points
+        self._checked(what, points)
+        return points.points
+
     def _checked(self, what: str, selection: Selection) -> np.ndarray:
         if not isinstance(selection, Selection):
             raise InputError(f"{what}: expected a selection such as body.where(x=0), not {type(selection).__name__}")
-        if not any(b is selection.body for b in self.bodies):
-            raise InputError(f"{what}: body {selection.body.name!r} belongs to another scene")
+        self._check_body(what, selection.body)
         if len(selection) == 0:
             low, high = selection.body.mesh.X.min(0), selection.body.mesh.X.max(0)
             spans = ", ".join(f"{a} in [{l:g}, {h:g}]" for a, l, h in zip("xyz", low, high))
@@ -167,11 +178,15 @@ class Scene:
             )
         return selection.index
 
-    def compile(self) -> Problem:
-        """The discrete problem of this scene as it now stands.
+    def _check_body(self, what: str, body: Body) -> None:
+        if not any(b is body for b in self.bodies):
+            raise InputError(f"{what}: body {body.name!r} belongs to another scene")
+
+    def compile(self, free: bool = False) -> Problem:
+        """The discrete problem of this scene as it now stands; ``free`` allows that nothing holds a body.
 
         Raises:
-            InputError: There is no body, no vertex is prescribed, or selections of moves overlap in part.
+            InputError: There is no body, nothing is held, or selections of moves overlap in part.
         """
         if not self.bodies:
             raise InputError("the scene has no body")
@@ -194,7 +209,8 @@ class Scene:
         prescribed = _Prescribed(X, self._moves)
         fixed = np.zeros(len(X), bool)
         fixed[prescribed.index] = True
-        if not fixed.any():
+        weak = weak_constraints(self._bindings)
+        if not (free or fixed.any() or any(w.anchored for w in weak)):
             raise InputError("no vertex is pinned or moved: the equilibrium is not unique; pin a part of each body")
         problem = Problem(
             name=self.name,
@@ -205,14 +221,17 @@ class Scene:
             prescribed=prescribed,
             f_ext=f_ext,
             mass=mass,
-            end=prescribed.end,
+            end=max([prescribed.end, *(b.targets.end for b in self._bindings if isinstance(b.targets, _Prescribed))]),
+            weak=weak,
         )
-        self._warn_of_loose_parts(problem)
+        if not free:
+            self._warn_of_loose_parts(problem)
         return problem
 
     def _warn_of_loose_parts(self, problem: Problem) -> None:
         held = np.zeros(problem.component.max() + 1, int)
-        np.add.at(held, problem.component[problem.fixed], 1)
+        anchors = [w.vertices.ravel() for w in problem.weak if w.anchored]
+        np.add.at(held, problem.component[np.concatenate([np.flatnonzero(problem.fixed), *anchors])], 1)
         for label in np.flatnonzero(held == 0):
             v = int(np.flatnonzero(problem.component == label)[0])
             body = next(b for b in problem.bodies if b.start <= v < b.stop)
@@ -287,6 +306,11 @@ def _materials(name: str, mesh: Mesh, material: Any) -> tuple[tuple[Material, np
 def _translated(mesh: Mesh, by: np.ndarray) -> Mesh:
     extra = {"skin": mesh.skin} if isinstance(mesh, TetMesh) else {}
     return type(mesh)(mesh.X + by, mesh.cells, groups=mesh.groups, cell_groups=mesh.cell_groups, **extra)
+
+
+def _check_times(what: str, over: float, start: float) -> None:
+    if not (math.isfinite(over) and over >= 0 and math.isfinite(start) and start >= 0):
+        raise InputError(f"{what}: over and start must be finite and not negative, not {over} and {start}")
 
 
 def _vector(what: str, values: Any) -> tuple[float, ...]:

@@ -31,10 +31,9 @@ def sweep(packed: Packed, x: np.ndarray, colors: np.ndarray, omega: float = 1.0)
         omega: Relaxation of each node's step; 0 < omega < 2 never raises the energy.
     """
     p = packed
-    functions = tuple(t.kind.sweep(t.model) for t in p.terms)
     relaxation = np.array([omega], p.dtype)
     arrays = x, p.seg_start, p.seg, p.idx, p.coef, p.nodal, p.parameters, relaxation
-    run(specialised(make_sweep, functions, p.dtype), arrays, colors, p.color_start, _grain(p))
+    run(specialised(make_sweep, p.functions, p.dtype), arrays, colors, p.color_start, _grain(p))
 
 
 def _grain(packed: Packed) -> int:

@@ -21,25 +21,41 @@ DENSE = 400  # unknowns up to which the coarsest matrix is factorised as a dense
 
 
 class BlockMatrix:
-    """A symmetric matrix of 3x3 blocks, one row of blocks a node, summed from the stiffness of pieces (n_piece, 8)."""
+    """A symmetric matrix of 3x3 blocks, one row of blocks a node, summed from the stiffness of pieces.
 
-    def __init__(self, node: np.ndarray, n_node: int) -> None:
+    Args:
+        node: Nodes of the pieces, (n_piece, 8).
+        n_node: Number of nodes.
+        constant: What is always added, in blocks of 3x3, (3 n_node, 3 n_node).
+    """
+
+    def __init__(self, node: np.ndarray, n_node: int, constant: scipy.sparse.bsr_matrix | None = None) -> None:
         key = (node[:, :, None].astype(np.int64) * n_node + node[:, None, :]).ravel()
         order = np.argsort(key, kind="stable")
         key = key[order]
-        first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+        present = key[np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))]
+        if constant is not None:
+            row = np.repeat(np.arange(n_node), np.diff(constant.indptr))
+            more = row * n_node + constant.indices
+            present = np.union1d(present, more)
         piece, a, b = order // 64, order // 8 % 8, order % 8
         self.source = 576 * piece + 24 * a + b  # where a block's first entry is in the stiffness
-        self.source_start = np.append(first, len(key))
-        self.column = (key[first] % n_node).astype(np.int32)
-        self.start = np.searchsorted(key[first] // n_node, np.arange(n_node + 1))
-        self.diagonal = np.flatnonzero(key[first] // n_node == self.column)
-        self.value = np.empty((len(first), 9))
+        self.source_start = np.append(np.searchsorted(key, present), len(key))
+        self.column = (present % n_node).astype(np.int32)
+        self.start = np.searchsorted(present // n_node, np.arange(n_node + 1))
+        self.diagonal = np.flatnonzero(present // n_node == self.column)
+        self.value = np.empty((len(present), 9))
+        self.constant = None
+        if constant is not None:
+            self.constant = np.zeros((len(present), 9))
+            self.constant[np.searchsorted(present, more)] = constant.data.reshape(-1, 9)
         self.inverse = np.empty((n_node, 9))
 
     def assemble(self, stiffness: np.ndarray, least: np.ndarray) -> None:
         """Sum stiffness (n_piece, 3, 8, 3, 8), with diagonal blocks no weaker than ``least`` (n_node,) [N/m]."""
         each(_gather, (self.source_start, self.source, stiffness, self.value), len(self.value), grain=1024)
+        if self.constant is not None:
+            self.value += self.constant
         _invert_diagonal(self.diagonal, self.value, least, self.inverse)
 
     def __matmul__(self, x: np.ndarray) -> np.ndarray:
@@ -57,11 +73,17 @@ class GridSolver:
 
     Args:
         grids: From fine to coarse, at least one.
+        hessian: What is added on the finest grid, constant, in blocks of 3x3.
     """
 
-    def __init__(self, grids: list[Grid]) -> None:
-        self.matrices = [BlockMatrix(g.node, g.n_node) for g in grids]
+    def __init__(self, grids: list[Grid], hessian: scipy.sparse.bsr_matrix | None = None) -> None:
         self.up = [interpolation(coarse) for coarse in grids[1:]]
+        self.matrices = []
+        for level, g in enumerate(grids):
+            self.matrices.append(BlockMatrix(g.node, g.n_node, hessian))
+            if hessian is not None and level < len(self.up):
+                up = scipy.sparse.kron(self.up[level], np.eye(3), format="bsr")
+                hessian = (up.T @ hessian @ up).tobsr((3, 3))
         self.down = [u.T.tocsr() for u in self.up]
         self.split = np.cumsum([len(g.node) for g in grids])[:-1]
 

@@ -32,17 +32,24 @@ class CoarseSpace:
         self.problem = problem
         self.grids, pieces = _grids(problem)
         self.cubature = Cubature(problem, self.grids, pieces, packed.slot)
-        self.solver = GridSolver(self.grids)
         free = np.flatnonzero(~problem.fixed)
+        self.solver = GridSolver(self.grids, self._weak_hessian())
         n, place = packed.n_free // 4, packed.slot[free]
         self.parents, self.weights = np.zeros((n, 8), np.int32), np.zeros((n, 8))  # U, in the order of the blocks
         self.parents[place], self.weights[place] = self.grids[0].parents[free], self.grids[0].weights[free]
         up = weight_matrix(self.parents, self.weights, self.grids[0].n_node)
         down = up.T.tocsr()
         self.restriction = down.indptr.astype(np.int64), down.indices.astype(np.int32), down.data
-        self.least = self._least(up, packed.stiffness())
+        self.least = self._least(up, packed.stiffness)
         plane = np.array([b.mesh.cells.shape[1] == 3 for b in problem.bodies])
         self.moves_z = ~plane[self.grids[0].body]
+
+    def _weak_hessian(self) -> scipy.sparse.bsr_matrix | None:
+        """UᵀHU of the weak constraints on the finest grid: bodies that are tied are so on the grid too."""
+        if self.problem.weak_energy is None:
+            return None
+        free = scipy.sparse.diags(1.0 * ~self.problem.fixed)
+        return self.problem.weak_energy.hessian(free @ interpolation(self.grids[0]))
 
     def _least(self, up: scipy.sparse.csr_matrix, stiffness: np.ndarray) -> list[np.ndarray]:
         """For each grid the least stiffness of its nodes (n_node,) [N/m], from that of the vertices that they move."""

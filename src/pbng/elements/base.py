@@ -48,9 +48,9 @@ class ElementKind(ABC):
 
     @abstractmethod
     def pack(self, isotropic: bool) -> Any:
-        """``(X, cells, e, a, opposite, once, coef, at, block, nodal, to)``: write the coefficients of corner a of
+        """``(X, cells, e, a, opposite, once, coef, at, block, data, nodal, to)``: write the coefficients of corner a of
         element e to ``coef[at + W * j]`` and add the constant part of its Hessian to ``nodal[to + W * j]``; ``once`` is
-        1, or 0 for a repeated incidence, which must have no effect."""
+        1, or 0 for a repeated incidence, which must have no effect; ``data`` is for weak constraints."""
 
     @abstractmethod
     def sweep(self, model: Model) -> Any:

@@ -127,7 +127,7 @@ class Simplex(ElementKind):
         plane, share = self.plane, self.share
 
         @inline
-        def pack(X, cells, e, a, opposite, once, coef, at, block, nodal, to):
+        def pack(X, cells, e, a, opposite, once, coef, at, block, data, nodal, to):
             p = corner(X, cells[e, opposite[a, 0]])
             ea = sub(corner(X, cells[e, opposite[a, 1]]), p)
             eb = (0.0, 0.0, 1.0) if plane else sub(corner(X, cells[e, opposite[a, -1]]), p)

@@ -94,7 +94,7 @@ class TwoGrid(PackedMethod):
         stiff = any(g.material.lam > 10 * g.material.mu for g in problem.groups)
         self.colors = np.tile(self.colors, solver.sweeps or (8 if stiff else 4))
         self.d = np.zeros(self.n_free)
-        stiffness = self.packed.stiffness().astype(float)
+        stiffness = self.packed.stiffness + self.packed.weak_stiffness
         self.compliance = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
         self.total_stiffness = float(stiffness.sum())
 
@@ -106,11 +106,13 @@ class TwoGrid(PackedMethod):
         with self.threads.used():
             extended = x + self.coarse.extend(increment)
             extended[fixed] = x[fixed]
-            lower = self.energy(self.packed.pack(extended)) < self.energy(self.packed.pack(x))
+            lower = self.energy(self.packed.pack(extended, self.targets)) < self.energy(
+                self.packed.pack(x, self.targets)
+            )
         return extended if lower else None
 
     def begin(self, x: np.ndarray) -> None:
-        self.x = self.packed.pack(x)
+        self.x = self.packed.pack(x, self.targets)
         self.g, self.z = self.x.copy(), self.x.copy()
         self.history = MixingHistory(self.cycle.memory) if self.cycle.memory else None
         self.E = self.energy(self.x)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pbng.assembly import ElementBlocks
+from pbng.constraints import WeakEnergy
 from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.packing import Packed, pack_problem
@@ -90,11 +91,13 @@ class PackedMethod:
         forward = np.arange(len(self.packed.color_start) - 1)
         self.colors = np.concatenate([forward, forward[::-1]]) if solver.symmetric else forward
         self.n_free = self.packed.n_free
+        self.weak = WeakEnergy(problem.weak, self.packed.n_slot, self.packed.slot) if problem.weak else None
         self.f_ext = np.zeros(4 * self.packed.n_slot)
         self.f_ext.reshape(-1, 4)[self.packed.slot, :3] = problem.f_ext
         self.loaded = bool(self.f_ext.any())
         self.forces = np.empty(4 * self.packed.n_slot)
-        self.x = self.packed.pack(problem.X)
+        self.targets = np.zeros((problem.n_target, 3))
+        self.x = self.packed.pack(problem.X, self.targets)
         self.iteration: Iteration | None = None
         self.setup_seconds = time.perf_counter() - compile_seconds() - start
 
@@ -123,7 +126,7 @@ class PackedMethod:
 
     def begin(self, x: np.ndarray) -> None:
         """Take x (n_vert, 3) as the state, in the present precision, with no history."""
-        self.x = self.packed.pack(x)
+        self.x = self.packed.pack(x, self.targets)
         acceleration: Acceleration = self.solver.acceleration
         self.iteration = acceleration.start(self)
 
@@ -144,7 +147,8 @@ class PackedMethod:
         sweep(self.packed, x, self.colors, omega)
 
     def energy(self, x: np.ndarray) -> float:
-        return self.blocks.energy(x) - self._work(x)
+        energy = self.blocks.energy(x) - self._work(x)
+        return energy + self.weak.energy(self._places(x), self.targets - self.packed.origin) if self.weak else energy
 
     def certify(self) -> Certificate:
         with self.threads.used():
@@ -154,15 +158,23 @@ class PackedMethod:
     def free_forces(self, x: np.ndarray) -> tuple[np.ndarray, float, int]:
         """Total forces on the free vertices [N], flat, with the force scale [N] and the number of inverted elements."""
         force_scale, inverted = self.blocks.forces(x, self.forces)
+        if self.weak:
+            weak, scale = self.weak.forces(self._places(x), self.targets - self.packed.origin)
+            self.forces.reshape(-1, 4)[:, :3] += weak
+            force_scale += scale
         return self.forces[: self.n_free] + self.f_ext[: self.n_free], force_scale, inverted
 
     def floor(self, dtype: Any = None) -> float:
         """Norm of the forces that moving each node by half a unit in the last place of the largest position makes."""
-        return self.rounding(self.x, dtype) * float(np.linalg.norm(self.packed.stiffness()))
+        return self.rounding(self.x, dtype) * float(np.linalg.norm(self.packed.stiffness + self.packed.weak_stiffness))
 
     def rounding(self, x: np.ndarray, dtype: Any = None) -> float:
         """Half a unit in the last place of the largest position [m], in a precision, by default that of x."""
         return 0.5 * float(np.finfo(dtype or x.dtype).eps) * float(np.abs(x).max(initial=0.0))
+
+    @staticmethod
+    def _places(x: np.ndarray) -> np.ndarray:
+        return x.reshape(-1, 4)[:, :3]
 
     def _work(self, x: np.ndarray) -> float:
         """Work [J] of the external forces since rest."""
