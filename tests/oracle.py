@@ -49,6 +49,20 @@ def sweep(problem, x, nodes, omega=1.0, paper=False):
     return x
 
 
+def move_compound(problem, x, beta, omega=1.0):
+    """x after a compound node, of whose movement vertex v takes part in the share beta[v], has been updated."""
+    f, A = beta @ (problem.f_ext + problem.forces(x)), np.zeros((3, 3))
+    for group in problem.groups:
+        G, V = shape_gradients(problem.X[group.cells])
+        a, b, at_rest = group.block()
+        g = np.einsum("na,naj->nj", beta[group.cells], G)
+        c = g if at_rest else np.einsum("nij,nj->ni", cof(deformation(x[group.cells], G)), g)
+        A += a * (V * (g * g).sum(1)).sum() * np.eye(3) + b * np.einsum("n,ni,nj->ij", V, c, c)
+    for w in problem.weak:
+        A += np.einsum("m,mij->ij", (w.weights * beta[w.vertices]).sum(1) ** 2, w.K)
+    return x + omega * np.outer(beta, np.linalg.solve(A, f))
+
+
 def energy_gradient(energy, x, direction, h):
     """Derivative of energy(x) along a direction, by differences of fourth order."""
     e = [energy(x + k * h * direction) for k in (-2, -1, 1, 2)]

@@ -19,7 +19,7 @@ TO_REST = {
 def energies(problem, x, sweeps, omega=1.0, paper=False):
     """Energy [J] before and after each sweep, and the last state."""
     packed = pack_problem(problem, np.float64, paper)
-    flat, colors = packed.pack(x), np.arange(len(packed.color_start) - 1)
+    flat, colors = packed.pack(x), np.arange(packed.n_color)
     E = [problem.energy(x)]
     for _ in range(sweeps):
         sweep(packed, flat, colors, omega)

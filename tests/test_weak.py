@@ -9,6 +9,7 @@ from conftest import held_box
 
 import pbng
 from pbng.coloring import is_valid
+from pbng.compounds import Compounds
 from pbng.constraints import WeakConstraints
 from pbng.packing import pack_problem
 from pbng.sweep import sweep
@@ -89,10 +90,14 @@ def test_sweep_is_the_oracles(bound, rng):
         packed = pack_problem(problem, np.float64)
         targets = problem.targets(problem.end)
         flat = packed.pack(x, targets)
-        n_color = len(packed.color_start) - 1
+        n_color = packed.n_color
         sweep(packed, flat, np.arange(n_color), 1.3)
         nodes = [i for c in range(n_color) for i in np.flatnonzero(problem.color == c)]
         expected = oracle.sweep(problem, x, nodes, 1.3)
+        compounds = Compounds(problem)
+        assert compounds.n > 5
+        for i in np.argsort(compounds.color, kind="stable"):
+            expected = oracle.move_compound(problem, expected, compounds.beta[i].toarray()[0], 1.3)
         np.testing.assert_allclose(packed.unpack(flat), expected, atol=1e-12 * (1 + np.abs(shift).max()))
 
 
@@ -155,3 +160,49 @@ def test_bad_constraints_are_named(change, word):
     WeakConstraints(**good)
     with pytest.raises(pbng.InputError, match=word):
         WeakConstraints(**{**good, **change})
+
+
+def two_blocks(k, n=6, shift=0.0):
+    """Paper, section 11.3: a block hangs below another, bound by springs that close a gap."""
+    scene = pbng.Scene(gravity=(0, -9.8, 0))
+    flesh = pbng.Corotated(E=1e3, nu=0.3, density=10)
+    block = pbng.shapes.box(size=(1, 1, 1), vertices=(n, n, n))
+    upper, lower = scene.add(block, flesh, at=(0, 1.1, 0)), scene.add(block, flesh, at=(shift, 0, shift))
+    scene.pin(upper.where(y=2.1))
+    scene.bind(lower.where(y=1.0), upper.where(y=1.1), k=k)
+    return scene.compile()
+
+
+@pytest.mark.parametrize(
+    ("solver", "shift", "iterations"),
+    [
+        (pbng.PBNG(dtype="float64"), 0.0, 120),
+        (pbng.MultigridPBNG(dtype="float64"), 0.0, 12),
+        (pbng.MultigridPBNG(), 0.1, 40),
+    ],
+)
+def test_stiff_springs_do_not_stall(solver, shift, iterations):
+    """k = 1e8 beside E = 1e3: without compound nodes thousands of sweeps move the lower block by a fraction only."""
+    problem = two_blocks(1e8, shift=shift)
+    result = pbng.solve(problem, solver, pbng.Budget(atol=1e-4, iterations=iterations))
+    assert result.status is pbng.Status.CONVERGED
+    gaps = problem.weak_energy.gaps(result.x, np.empty((0, 3)))
+    assert np.abs(gaps).max() < 1e-5
+    carried = problem.f_ext[~problem.fixed].sum(0)  # what hangs on the pins
+    np.testing.assert_allclose(problem.forces(result.x)[problem.fixed].sum(0), carried, atol=1e-2)
+
+
+def test_compounds_carry_what_is_tied_to_them():
+    """No spring of the vertex changes its length, whatever the sides' weights; prescribed vertices never move."""
+    problem = two_blocks(1e4, shift=0.1)
+    compounds = Compounds(problem)
+    (w, *more) = problem.weak
+    assert more and compounds.n > 10
+    lower = problem.bodies[1].start
+    for i in range(compounds.n):
+        beta = compounds.beta[i].toarray()[0]
+        leader = int(np.flatnonzero((beta == 1) & (np.arange(problem.n_vert) < lower))[0])
+        assert not problem.fixed[beta != 0].any()
+        for weak in problem.weak:
+            mine = (weak.vertices == leader).any(1)
+            np.testing.assert_allclose((weak.weights * beta[weak.vertices]).sum(1)[mine], 0, atol=1e-14)

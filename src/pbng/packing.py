@@ -3,21 +3,21 @@
 Free vertices are renumbered: by colour, inside a colour by the groups they touch, along a Morton curve, and in windows
 by falling valence; 16 consecutive ones form a block. A *row* holds one incidence for each lane of a block; the rows of
 a block that belong to one element group form a *segment*. Lanes that run out of incidences repeat one with weight
-zero. Prescribed vertices come after all blocks, and the targets of weak constraints after them.
+zero. Blocks of compound nodes follow; their "positions" are movements, zero between sweeps. Prescribed vertices come
+after all blocks, and the targets of weak constraints after them.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from pbng.assembly import group_parameters
-from pbng.constraints import WeakConstraints
+from pbng.compounds import Compounds
 from pbng.dispatch import call, specialised
-from pbng.elements import weak
 from pbng.elements.base import W
+from pbng.families import Family, Groups, families
 from pbng.jit import inline, serial
 from pbng.parallel import array, body, each, rows
-from pbng.problem import Coupling, Problem
+from pbng.problem import Problem
 
 NODAL = 9  # numbers a node: external force (3), constant part of its Hessian (6, upper triangle)
 WINDOW = 512  # nodes within which valence is sorted: enough to fill blocks evenly, few enough to keep locality
@@ -30,8 +30,8 @@ class Packed:
     Attributes:
         slot: New number of each vertex, (n_vert,).
         origin: What positions are stored relative to [m], (3,): zero but for scenes far from the origin.
-        n_slot, n_block: Vertices and padding in all; blocks of W of them that are free.
-        color_start: First block of each colour, (n_color + 1,).
+        n_slot, n_block: Length of position arrays; blocks of W free vertices.
+        color_start: First block of each colour, the first past the last included.
         seg_start: First segment of each block, (n_block + 1,).
         seg: For each segment: term, place of the parameters, rows, place in ``idx``, place in ``coef``, (n, 5).
         idx, coef: The rows: places of the other corners in a flat position array, and coefficients; flat, lane fastest.
@@ -41,6 +41,8 @@ class Packed:
         stiffness: Constant part of each node's elastic stiffness [N/m], a third of its Hessian's trace, (n_block * W,).
         weak_stiffness: The same of weak constraints.
         n_target: Number of targets, the last slots.
+        n_color: Colours of vertices; those that follow are of compound nodes.
+        carried: For each of these the places of the vertices that it moves, of the compounds, and the shares.
     """
 
     slot: np.ndarray
@@ -58,6 +60,8 @@ class Packed:
     stiffness: np.ndarray
     weak_stiffness: np.ndarray
     n_target: int
+    n_color: int
+    carried: tuple
 
     @property
     def dtype(self) -> np.dtype:
@@ -99,63 +103,74 @@ def aligned(n: int, dtype) -> np.ndarray:
 
 def pack_problem(problem: Problem, dtype=np.float32, paper_block: bool = False) -> Packed:
     """Colour a problem and lay it out; ``paper_block`` takes Eq. (32) in place of the majorising block."""
+    compounds = Compounds(problem) if problem.weak else None
+    compounds = compounds if compounds and compounds.n else None
     color_start, node = _numbering(problem)
-    n_block = len(node) // W
-    slot = np.full(problem.n_vert, -1, np.int64)
+    n_color, n_block = len(color_start) - 1, len(node) // W
+    f_ext = problem.f_ext
+    if compounds:
+        node, color_start = _with_compounds(problem, compounds, node, color_start)
+        f_ext = np.concatenate([f_ext, compounds.beta @ f_ext])
     real = node >= 0
-    slot[node[real]] = np.flatnonzero(real)
-    rest = np.flatnonzero(slot < 0)
-    slot[rest] = len(node) + np.arange(len(rest))
+    place = np.full(len(f_ext), -1, np.int64)  # of vertices, then of compounds
+    place[node[real]] = np.flatnonzero(real)
+    rest = np.flatnonzero(place < 0)
+    place[rest] = len(node) + np.arange(len(rest))
+    slot = place[: problem.n_vert].copy()
     owner = np.where(real, node, np.repeat(node[::W], W))  # padding lanes repeat the first of their block
+    n_slot = len(node) + len(rest) + problem.n_target
+    places = np.concatenate([slot, np.arange(n_slot - problem.n_target, n_slot)])
 
-    n_target, n_slot = problem.n_target, len(node) + len(rest) + problem.n_target
-    places = np.concatenate([slot, np.arange(n_slot - n_target, n_slot)])
-    parameters, table, numbers, functions = _terms(problem, dtype, paper_block)
-    spans, n_idx, n_coef = _layout(problem, owner, table)
+    groups = Groups(problem, dtype, paper_block, compounds is not None)
+    seen = families(problem, compounds)
+    spans, n_idx, n_coef = _layout(seen, owner, groups.table)
     idx, coef = aligned(n_idx, np.uint32), aligned(n_coef, dtype)
-    nodal = np.zeros((n_block, NODAL, W))
-    nodal[:, :3] = problem.f_ext[owner].reshape(n_block, W, 3).transpose(0, 2, 1) * real.reshape(n_block, 1, W)
+    nodal = np.zeros((len(node) // W, NODAL, W))
+    nodal[:, :3] = f_ext[owner].reshape(-1, W, 3).transpose(0, 2, 1) * real.reshape(-1, 1, W)
     stiffness = []
-    for weakly in (False, True):
-        for coupling, (seg_start, seg) in zip(problem.couplings, spans):
-            if isinstance(coupling.source, WeakConstraints) == weakly:
-                _fill(problem, coupling, owner, real, places, seg_start, seg, table, numbers, idx, coef, nodal)
-        stiffness.append((nodal[:, 3] + nodal[:, 6] + nodal[:, 8]).ravel() / 3)
+    for elastic in (True, False):
+        for family, span in zip(seen, spans):
+            if family.elastic == elastic:
+                _fill(family, span, problem.X, owner, real, places, groups, idx, coef, nodal)
+        stiffness.append((nodal[:n_block, 3] + nodal[:n_block, 6] + nodal[:n_block, 8]).ravel() / 3)
     seg_start, seg = spans[0] if len(spans) == 1 else _merge(spans)
     seg = seg[:, :5].copy()
     return Packed(
         slot, _origin(problem.X), n_slot, n_block, color_start, seg_start, seg, idx, coef,
-        _padded(nodal, real).astype(dtype).ravel(), parameters, functions, stiffness[0], stiffness[1] - stiffness[0],
-        n_target,
+        _padded(nodal, real).astype(dtype).ravel(), groups.parameters, groups.functions,
+        stiffness[0], stiffness[1] - stiffness[0], problem.n_target, n_color,
+        _carried(compounds, place, color_start[n_color:], np.dtype(dtype)) if compounds else (),
     )  # fmt: skip
 
 
-def _terms(problem: Problem, dtype, paper_block: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple]:
-    """The numbers kernels read, a table of all groups with the weak ones, the numbers of their blocks, and what sweeps.
-
-    Columns of the table: term, place of the parameters, indices a row, coefficients a row.
-    """
-    terms = list(dict.fromkeys(g.term for g in problem.groups))
-    parameters, first = group_parameters(problem.groups, dtype, paper_block)
-    table = [
-        (terms.index(g.term), p, W * g.kind.others, W * g.kind.width(g.term.model.isotropic))
-        for g, p in zip(problem.groups, first)
-    ]
-    others = [w.corners - 1 + w.anchored for w in problem.weak]
-    for n, count in enumerate(others):
-        table.append((len(terms), len(parameters) + n, W * count, W * weak.width(count)))
-    blocks = [g.block(paper_block) for g in problem.groups]
-    numbers = [(b.a, b.b, b.b if b.at_rest else 0.0) for b in blocks] + [(0.0, 0.0, 0.0)] * len(others)
-    functions = tuple(t.kind.sweep(t.model) for t in terms) + ((weak.sweep,) if others else ())
-    return np.concatenate([parameters, np.array(others, dtype)]), np.array(table), np.array(numbers), functions
+def _with_compounds(problem: Problem, compounds: Compounds, node: np.ndarray, color_start: np.ndarray):
+    """The places of vertices and, behind them, of compounds, numbered on from the vertices; first blocks of colours."""
+    nodes, starts = [node], color_start.tolist()
+    for c in range(compounds.color.max() + 1):
+        mine = problem.n_vert + np.flatnonzero(compounds.color == c)
+        nodes.append(np.concatenate([mine, np.full(-len(mine) % W, -1)]))
+        starts.append(starts[-1] + len(nodes[-1]) // W)
+    return np.concatenate(nodes), np.array(starts)
 
 
-def _layout(problem: Problem, owner: np.ndarray, table: np.ndarray) -> tuple[list, int, int]:
-    """For each coupling the segments as :func:`_segments` gives them, and the lengths of ``idx`` and ``coef``."""
+def _carried(compounds: Compounds, place: np.ndarray, color_start: np.ndarray, dtype: np.dtype) -> tuple:
+    """For each colour of compounds: places of the vertices it moves, of the compounds, and the shares (k, 1)."""
+    member = compounds.beta.tocoo()
+    n_vert = compounds.beta.shape[1]
+    to, source = place[member.col], place[n_vert + member.row]
+    color = np.searchsorted(W * color_start, source, side="right") - 1
+    return tuple(
+        (to[color == c], source[color == c], member.data[color == c, None].astype(dtype))
+        for c in range(len(color_start) - 1)
+    )
+
+
+def _layout(seen: list[Family], owner: np.ndarray, table: np.ndarray) -> tuple[list, int, int]:
+    """For each family the segments as :func:`_segments` gives them, and the lengths of ``idx`` and ``coef``."""
     spans = []
     n_idx = n_coef = 0
-    for c in problem.couplings:
-        seg_start, seg = _segments(owner, c.start, c.incident, c.group, c.corners, table)
+    for f in seen:
+        seg_start, seg = _segments(owner, f.start, f.incident, f.group, f.corners, table)
         seg[:, 3] += n_idx
         seg[:, 4] += n_coef
         if len(seg):
@@ -165,23 +180,15 @@ def _layout(problem: Problem, owner: np.ndarray, table: np.ndarray) -> tuple[lis
     return spans, n_idx, n_coef
 
 
-def _fill(problem, c: Coupling, owner, real, places, seg_start, seg, table, numbers, idx, coef, nodal) -> None:
-    """Write the rows of a coupling, and add what is constant of its Hessians to ``nodal``."""
-    if isinstance(c.source, WeakConstraints):
-        opposite = weak.opposite(c.corners, c.source.anchored)
-        data = weak.weak_data(c.source.weights, c.source.K, c.source.anchored)
-        packers, packer = (weak.pack,), np.zeros(len(table), np.int64)
-    else:
-        opposite, data, kind = c.source.opposite, np.zeros((1, 1)), c.source
-        own = [kind.pack(g.term.model.isotropic) for g in problem.groups]
-        packers = tuple(dict.fromkeys(p for p, g in zip(own, problem.groups) if g.kind is kind))
-        packer = np.array([packers.index(p) if p in packers else 0 for p in own])
-    sizes = np.array([c.corners, opposite.shape[1], c.cells.shape[1], data.shape[1]])
+def _fill(f: Family, span, X, owner, real, places, groups: Groups, idx, coef, nodal) -> None:
+    """Write the rows of a family, and add what is constant of its Hessians to ``nodal``."""
+    sizes = np.array([f.corners, f.opposite.shape[1], f.cells.shape[1], f.data.shape[1]])
     arrays = (
-        owner, real, places, problem.X, seg_start, seg, np.ascontiguousarray(c.cells), c.group, c.start, c.incident,
-        np.ascontiguousarray(opposite), table, packer, numbers, data, idx, coef, nodal, sizes,
+        owner, real, places, X, *span, np.ascontiguousarray(f.cells), f.group, f.start, f.incident,
+        np.ascontiguousarray(f.opposite), groups.table, f.packer, groups.numbers, np.ascontiguousarray(f.data),
+        idx, coef, nodal, sizes,
     )  # fmt: skip
-    each(specialised(make_fill, packers, coef.dtype), arrays, len(seg_start) - 1, grain=64)
+    each(specialised(make_fill, f.packers, coef.dtype), arrays, len(span[0]) - 1, grain=64)
 
 
 def _origin(X: np.ndarray) -> np.ndarray:

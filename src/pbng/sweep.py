@@ -21,19 +21,29 @@ _1, _2, _3, _4, _5, _6 = (uint64(W * j) for j in range(1, 7))
 _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(7, 12))
 
 
-def sweep(packed: Packed, x: np.ndarray, colors: np.ndarray, omega: float = 1.0) -> None:
-    """Update every free node once, in place.
+def sweep(packed: Packed, x: np.ndarray, colors: np.ndarray, omega: float = 1.0, times: int = 1) -> None:
+    """Update every free node once, or ``times`` times, in place.
 
     Args:
         packed: The problem's layout.
         x: Positions as ``packed.pack`` makes them.
-        colors: Colours in the order to be taken; several sweeps at once by repeating them.
+        colors: Colours in the order to be taken; compound nodes, if there are any, have their turn after each sweep.
         omega: Relaxation of each node's step; 0 < omega < 2 never raises the energy.
     """
     p = packed
     relaxation = np.array([omega], p.dtype)
     arrays = x, p.seg_start, p.seg, p.idx, p.coef, p.nodal, p.parameters, relaxation
-    run(specialised(make_sweep, p.functions, p.dtype), arrays, colors, p.color_start, _grain(p))
+    blocks = specialised(make_sweep, p.functions, p.dtype)
+    if not p.carried:
+        run(blocks, arrays, np.tile(colors, times), p.color_start, _grain(p))
+        return
+    place = x.reshape(-1, 4)
+    for _ in range(times):
+        run(blocks, arrays, colors, p.color_start, _grain(p))
+        for color, (to, source, share) in enumerate(p.carried, p.n_color):
+            run(blocks, arrays, np.array([color]), p.color_start)
+            place[to] += share * place[source]
+            place[source] = 0
 
 
 def _grain(packed: Packed) -> int:

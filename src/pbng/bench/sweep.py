@@ -36,7 +36,7 @@ def measure(
             first = time.perf_counter() - start  # holds compilation
             setup = _setup_seconds(problem, dtype)
             x = packed.pack(problem.X)
-            colors = np.tile(np.arange(len(packed.color_start) - 1), 5)
+            colors = np.tile(np.arange(packed.n_color), 5)
             for count in threads:
                 numba.set_num_threads(count)
                 contestants: dict[str, Callable[[], Any]] = {"pbng": partial(sweep, packed, x, colors)}

@@ -54,9 +54,10 @@ class BlockMatrix:
     def assemble(self, stiffness: np.ndarray, least: np.ndarray) -> None:
         """Sum stiffness (n_piece, 3, 8, 3, 8), with diagonal blocks no weaker than ``least`` (n_node,) [N/m]."""
         each(_gather, (self.source_start, self.source, stiffness, self.value), len(self.value), grain=1024)
+        _raise_diagonal(self.diagonal, self.value, least)
         if self.constant is not None:
             self.value += self.constant
-        _invert_diagonal(self.diagonal, self.value, least, self.inverse)
+        _invert_diagonal(self.diagonal, self.value, self.inverse)
 
     def __matmul__(self, x: np.ndarray) -> np.ndarray:
         y = np.empty_like(x)
@@ -160,8 +161,8 @@ def _gather(arguments, low, high):
 
 
 @serial
-def _invert_diagonal(diagonal, value, least, inverse):
-    """Raise diagonal blocks, those weaker than ``least`` to it, and invert them."""
+def _raise_diagonal(diagonal, value, least):
+    """Raise diagonal blocks, those weaker than ``least`` to it."""
     for r in range(diagonal.size):
         a = value[diagonal[r]]
         mean = (a[0] + a[4] + a[8]) / 3
@@ -169,6 +170,12 @@ def _invert_diagonal(diagonal, value, least, inverse):
         a[0] += lift
         a[4] += lift
         a[8] += lift
+
+
+@serial
+def _invert_diagonal(diagonal, value, inverse):
+    for r in range(diagonal.size):
+        a = value[diagonal[r]]
         c0, c1, c2 = a[4] * a[8] - a[5] * a[7], a[5] * a[6] - a[3] * a[8], a[3] * a[7] - a[4] * a[6]
         d = 1 / (a[0] * c0 + a[1] * c1 + a[2] * c2)
         i = inverse[r]

@@ -105,7 +105,7 @@ class Simplex(ElementKind):
         return edges
 
     @cache
-    def _edges(self, load: Any) -> Any:
+    def edges(self, load: Any) -> Any:
         """``(g, j, x) -> a, b, e`` from the scratch array at lane position j and the last corner x."""
         if self.plane:
 
@@ -189,7 +189,7 @@ class Simplex(ElementKind):
     @cache
     def _incidence(self, model: Model) -> Any:
         """``(g, j, x, coef, c, b, m) -> V P g, h, v``: a node's negative force and the term h v vᵀ of its Hessian."""
-        edges, stress = self._edges(vec), model.stress
+        edges, stress = self.edges(vec), model.stress
         if model.isotropic:
 
             @inline
@@ -216,7 +216,7 @@ class Simplex(ElementKind):
     @cache
     def _element(self) -> Any:
         """``(gx, gX, j) -> F, ga, gb, ge, V`` in float64 from the current and the rest positions in scratch arrays."""
-        edges, rest_edges, share = self._edges(wide_vec), self._edges(vec), self.share
+        edges, rest_edges, share = self.edges(wide_vec), self.edges(vec), self.share
         last = _R if self.plane else _S
 
         @inline

@@ -92,7 +92,7 @@ class TwoGrid(PackedMethod):
             self.coarse = CoarseSpace(problem, self.packed)
         self.setup_seconds += time.perf_counter() - compile_seconds() - start
         stiff = any(g.material.lam > 10 * g.material.mu for g in problem.groups)
-        self.colors = np.tile(self.colors, solver.sweeps or (8 if stiff else 4))
+        self.times = solver.sweeps or (8 if stiff else 4)
         self.d = np.zeros(self.n_free)
         stiffness = self.packed.stiffness + self.packed.weak_stiffness
         self.compliance = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)

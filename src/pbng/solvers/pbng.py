@@ -77,6 +77,7 @@ class PackedMethod:
     every = 10
     first_trial = FIRST_PROBE  # steps before another number of threads is tried
     estimates_error = False
+    times = 1  # sweeps that apply() takes
 
     def __init__(self, problem: Problem, solver: PBNG) -> None:
         self.problem, self.solver = problem, solver
@@ -88,7 +89,7 @@ class PackedMethod:
             self.packed = self.layout(first)
             X = problem.X - self.packed.origin
             self.blocks = ElementBlocks(problem.groups, X, self.packed.slot, self.packed.n_slot)
-        forward = np.arange(len(self.packed.color_start) - 1)
+        forward = np.arange(self.packed.n_color)
         self.colors = np.concatenate([forward, forward[::-1]]) if solver.symmetric else forward
         self.n_free = self.packed.n_free
         self.weak = WeakEnergy(problem.weak, self.packed.n_slot, self.packed.slot) if problem.weak else None
@@ -144,7 +145,7 @@ class PackedMethod:
         return self.packed.unpack(self.x)
 
     def apply(self, x: np.ndarray, omega: float = 1.0) -> None:
-        sweep(self.packed, x, self.colors, omega)
+        sweep(self.packed, x, self.colors, omega, self.times)
 
     def energy(self, x: np.ndarray) -> float:
         energy = self.blocks.energy(x) - self._work(x)
