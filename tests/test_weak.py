@@ -177,7 +177,7 @@ def two_blocks(k, n=6, shift=0.0):
     ("solver", "shift", "iterations"),
     [
         (pbng.PBNG(dtype="float64"), 0.0, 120),
-        (pbng.MultigridPBNG(dtype="float64"), 0.0, 12),
+        (pbng.MultigridPBNG(dtype="float64"), 0.0, 14),
         (pbng.MultigridPBNG(), 0.1, 40),
     ],
 )
@@ -196,8 +196,8 @@ def test_compounds_carry_what_is_tied_to_them():
     """No spring of the vertex changes its length, whatever the sides' weights; prescribed vertices never move."""
     problem = two_blocks(1e4, shift=0.1)
     compounds = Compounds(problem)
-    (w, *more) = problem.weak
-    assert more and compounds.n > 10
+    assert len(problem.weak) > 1
+    assert compounds.n > 10
     lower = problem.bodies[1].start
     for i in range(compounds.n):
         beta = compounds.beta[i].toarray()[0]

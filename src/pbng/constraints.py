@@ -133,7 +133,7 @@ class WeakEnergy:
         """Hessian [N/m] in blocks of 3x3, (3 n, 3 n), or U'HU for interpolation weights U (n, k): it is constant."""
         W = (self.weights if U is None else self.weights @ U).tocsr()
         k, unit = self.K[:, 0, 0], np.eye(3)
-        same = (self.K == k[:, None, None] * unit).all((1, 2))  # the same in all directions: numbers for blocks will do
+        same = (k[:, None, None] * unit == self.K).all((1, 2))  # the same in all directions: numbers for blocks will do
         A = W[same]
         total = _blocks(A.T @ scipy.sparse.diags(k[same]) @ A, unit)
         if not same.all():

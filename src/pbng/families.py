@@ -99,8 +99,9 @@ def families(problem: Problem, compounds: Compounds | None) -> list[Family]:
             counts = np.bincount(problem.n_vert + i.compound, minlength=problem.n_vert + n_compound)
             start, incident = np.concatenate([[0], np.cumsum(counts)]), np.arange(len(i.cells), dtype=np.int32)
             group = (i.group + n_group).astype(np.int32)
-            cells, *rest = _of_compounds(i)
-            found.append(Family(1, cells, group, start, incident, *rest, np.zeros(2 * n_group, np.int64)))
+            cells, opposite, data, packer = _of_compounds(i)
+            only = np.zeros(2 * n_group, np.int64)
+            found.append(Family(1, cells, group, start, incident, opposite, data, (packer,), only))
     return found
 
 
@@ -117,12 +118,12 @@ def _of_vertices(problem: Problem, source: Any) -> tuple[np.ndarray, np.ndarray,
     return source.opposite, np.zeros((1, 1)), packers, packer
 
 
-def _of_compounds(i: CompoundIncidences) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple]:
-    """Cells, opposite, data and packers of a family of compounds."""
-    if not isinstance(i.source, WeakConstraints):
-        return i.cells, compound.corners(i.source), i.beta, (compound.pack(i.source),)
-    w = i.source
+def _of_compounds(i: CompoundIncidences) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
+    """Cells, opposite, data and packer of a family of compounds."""
+    w: Any = i.source
+    if not isinstance(w, WeakConstraints):
+        return i.cells, compound.corners(w), i.beta, compound.pack(w)
     seen = weak.weak_data(w.weights[i.cell], w.K[i.cell], w.anchored)
     own = (w.weights[i.cell] * i.beta).sum(1)  # how much C changes when the compound moves
     cells = np.column_stack([i.cells[:, :1], i.cells])  # the first place stands for the compound, which is nowhere
-    return cells, np.arange(1, cells.shape[1])[None], np.column_stack([own, seen]), (weak.pack,)
+    return cells, np.arange(1, cells.shape[1])[None], np.column_stack([own, seen]), weak.pack
