@@ -56,7 +56,7 @@ def closest_on_faces(p: np.ndarray, X: np.ndarray, faces: np.ndarray) -> tuple[n
     chunk = max(1, PAIRS // max(len(faces), 1))
     for first in range(0, len(p), chunk):
         mine = np.arange(first, min(first + chunk, len(p)))
-        lists = tree.query_ball_point(p[mine], near[mine] + reach * (1 + 1e-9), return_sorted=True)
+        lists = tree.query_ball_point(p[mine], (near[mine] + reach) * (1 + 1e-9), return_sorted=True)
         counts = np.array([len(l) for l in lists])
         point, candidate = np.repeat(mine, counts), np.concatenate([np.asarray(l, np.int64) for l in lists])
         w = _weights(p[point], corners[candidate])

@@ -151,8 +151,10 @@ class Scene:
         """
         points = self._checked_points("bind", a)
         other: Any = b
-        if isinstance(b, Body | Selection | Points):
-            self._checked_points("bind", b.where(...) if isinstance(b, Body) else b)
+        if isinstance(b, Body):
+            self._check_body("bind", b)
+        elif isinstance(b, Selection | Points):
+            self._checked_points("bind", b)
         elif isinstance(b, Motion) or callable(b):
             _check_times("bind", over, start)
             move, X = _Move(np.arange(len(points)), as_motion(b), start, over), points.X
