@@ -97,7 +97,7 @@ def test_stiffness_along_and_across_the_normal(scene):
 
 def test_points_that_move(scene):
     """A motion is that of the points from rest; its end is the scene's."""
-    scene, upper, lower = scene
+    scene, _, lower = scene
     face = lower.where(y=0.0)
     scene.bind(face, pbng.Translate((0, -1, 0)), k=1e9, over=2.0, start=1.0)
     problem = scene.compile()
@@ -110,8 +110,8 @@ def test_points_that_move(scene):
 
 
 def test_frames_follow_moving_points(scene):
-    scene, upper, lower = scene
-    scene.bind(lower.where(y=0.0), lambda t, X: X + [0, 0, t], k=1e9)
+    scene, _, lower = scene
+    scene.bind(lower.where(y=0.0), lambda t, X: X + np.array([0, 0, t]), k=1e9)
     frames = list(pbng.simulate(scene, pbng.PBNG(dtype="float64"), pbng.Budget(iterations=300), frames=3, fps=10))
     for frame in frames:
         z = frame.x[lower.where(y=0.0).index, 2] - frame.problem.X[lower.where(y=0.0).index, 2]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fake_runs import Body, Problem, Status, box, frames, sheet
 
+import pbng
 from pbng.errors import InputError
 from pbng.io import store
 from pbng.io.frames import FrameWriter, Run, read_run
@@ -261,3 +262,16 @@ def test_nothing_of_the_problem_but_bodies_is_needed(tmp_path):
     with FrameWriter(tmp_path / "dir.with.dots") as out:
         out.write(frame)
     assert Run(tmp_path / "dir.with.dots").name == "dir.with"
+
+
+def test_velocities_and_springs_are_kept(tmp_path):
+    scene = pbng.Scene()
+    body = scene.add(pbng.shapes.box((1.0, 1.0, 1.0), 3), pbng.Corotated(E=1e4, nu=0.3))
+    scene.bind(body.where(x=0.0), [0.0, 2, 0], k=10.0)
+    with pbng.FrameWriter(tmp_path / "run") as out:
+        for frame in pbng.simulate(scene, frames=2, fps=10, inertia=True):
+            out.write(frame)
+    last = pbng.read_run(tmp_path / "run")[-1]
+    np.testing.assert_array_equal(last.v, frame.v)
+    np.testing.assert_allclose(last.springs[:, 0], frame.x[body.where(x=0.0).index])
+    np.testing.assert_allclose(last.springs[:, 1], np.tile([0.0, 2, 0], (9, 1)), atol=1e-12)

@@ -15,13 +15,15 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pbng.cli_console import FAILED, INTERRUPTED, blaming, err, out, table
-from pbng.drivers import simulate
+from pbng.drivers import Frame, simulate
 from pbng.errors import InputError
 from pbng.gallery.recipe import Recipe
 from pbng.io.frames import FrameWriter
 from pbng.problem import Problem
 from pbng.solvers import base
 from pbng.solvers.base import Budget, Result, Solver, Status
+
+SWINGING = 1.0  # how long [s] to look on after the last motion has ended, where there is inertia
 
 
 @dataclass(eq=False)
@@ -33,6 +35,7 @@ class Report:
     frames: int
     fps: float
     results: list[Result] = field(default_factory=list)
+    last: Frame | None = None
     written: int = 0
     stopped: str = ""
     exit_code: int = 0
@@ -69,21 +72,25 @@ def run(
     if not overwrite and (path / "run.json").exists() and any(path.glob("frame_*.npz")):
         raise InputError(f"{path} already holds a run; --overwrite replaces it, --out chooses another folder")
     with blaming(file):
-        problem = recipe.scene.compile()
+        problem = recipe.scene.compile(free=recipe.inertia)
         fps = recipe.fps if fps is None else fps
-        frames = (recipe.frames or _until_the_end(problem, fps)) if frames is None else frames
+        frames = (recipe.frames or _until_the_end(problem, fps, recipe.inertia)) if frames is None else frames
         report = Report(path, problem, frames, fps)
         with _progress(label or problem.name, frames, budget) as watch, _folder(path):
             writer = FrameWriter(path, fps=fps, overwrite=overwrite, info={"solver": repr(solver)})
-            coming = simulate(problem, solver, budget, frames=frames, fps=fps, monitor=watch.monitor)
+            coming = simulate(
+                problem, solver, budget, frames=frames, fps=fps, monitor=watch.monitor,
+                inertia=recipe.inertia, dt=recipe.dt, substeps=recipe.substeps,
+            )  # fmt: skip
             _write(coming, writer, watch, report)
     return report
 
 
-def _until_the_end(problem: Problem, fps: float) -> int:
+def _until_the_end(problem: Problem, fps: float, inertia: bool) -> int:
     if not (math.isfinite(fps) and fps > 0):
         raise InputError(f"fps must be positive, not {fps}")
-    return 1 + math.ceil(problem.end * fps - 1e-9)
+    end = problem.end + SWINGING if inertia else problem.end
+    return 1 + math.ceil(end * fps - 1e-9)
 
 
 def _write(coming: Iterator[Any], writer: FrameWriter, watch: "_Watch", report: Report) -> None:
@@ -95,6 +102,7 @@ def _write(coming: Iterator[Any], writer: FrameWriter, watch: "_Watch", report: 
                 return
             writer.write(frame)
             report.results.append(replace(frame.result, x=np.empty((0, 3))))  # they are on the disk
+            report.last = frame
             watch.done(frame)
     except KeyboardInterrupt:
         report.stopped, report.exit_code = "Interrupted.", INTERRUPTED
@@ -199,7 +207,10 @@ def _kept(report: Report) -> str:
 
 
 def _rows(report: Report, results: list[Result], compiled: float) -> Iterator[tuple[str, str]]:
-    problem, iterations = report.problem, sum(r.iterations for r in results)
+    problem, setup_seconds = report.problem, results[0].setup_seconds
+    if report.last is not None and report.last.v is not None:
+        results = results[1:] or results  # the first frame is the start
+    iterations = sum(r.iterations for r in results)
     seconds = sum(r.seconds for r in results)
     # A frame that begins at rounding level, as one at rest does, has nothing to reduce.
     reductions = [r.reduction for r in results if r.iterations and r.status is not Status.PRECISION]
@@ -214,9 +225,14 @@ def _rows(report: Report, results: list[Result], compiled: float) -> Iterator[tu
     errors = [r.error for r in results if math.isfinite(r.error)]
     if errors:
         yield "position error", f"estimated, median {np.median(errors):.1e} m, worst {max(errors):.1e} m"
+    if report.last is not None and report.last.v is not None:
+        frame = report.last
+        speed = " ".join(f"{p:.3g}" for p in frame.momentum)
+        yield "at the end", f"potential {frame.potential_energy:.4g} J, kinetic {frame.kinetic_energy:.4g} J"
+        yield "momentum", f"{speed} kg m/s"
     yield "inverted elements", f"{results[-1].inverted:,} at the end, at most {max(r.inverted for r in results):,}"
     yield "solving", f"{seconds:.2f} s, {1e3 * seconds / max(iterations, 1):.2f} ms an iteration"
-    yield "set-up, compiling", f"{results[0].setup_seconds:.2f} s, {compiled:.2f} s"
+    yield "set-up, compiling", f"{setup_seconds:.2f} s, {compiled:.2f} s"
     memory = _peak_memory()
     if memory is not None:
         yield "memory", f"{memory / 2**20:,.0f} MiB at most"

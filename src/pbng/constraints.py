@@ -110,6 +110,11 @@ class WeakEnergy:
         C[self.anchored] -= targets
         return C
 
+    def ends(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """The two points (m, 2, 3) [m] that each constraint ties together."""
+        first = self.weights.maximum(0) @ x
+        return np.stack([first, first - self.gaps(x, targets)], axis=1)
+
     def energy(self, x: np.ndarray, targets: np.ndarray) -> float:
         """½ Σ Cᵀ K C [J]."""
         C = self.gaps(x, targets)

@@ -1,10 +1,13 @@
-"""Drivers: one equilibrium, or one a frame."""
+"""Drivers: one equilibrium, one a frame, or motion."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from pbng.dynamics import BackwardEuler, steps_of, velocities
 from pbng.errors import InputError
 from pbng.problem import Problem
 from pbng.scene import Scene
@@ -16,13 +19,44 @@ from pbng.solvers.pbng import PBNG
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame of a simulation: its number, time [s], positions (n_vert, 3) [m] of all bodies, and certificate."""
+    """One frame of a simulation: its number, time [s], positions (n_vert, 3) [m] of all bodies, and certificate.
+
+    With inertia there are velocities v (n_vert, 3) [m/s] too, and the energy of the result is the incremental potential
+    of the last step.
+    """
 
     index: int
     t: float
     x: np.ndarray
     result: Result
     problem: Problem
+    v: np.ndarray | None = None
+
+    @property
+    def potential_energy(self) -> float:
+        """Elastic energy and that of weak constraints, less the work of external forces since rest [J]."""
+        return self.problem.energy(self.x, self.problem.targets(self.t))
+
+    @property
+    def springs(self) -> np.ndarray:
+        """The two ends (m, 2, 3) [m] of each weak constraint."""
+        weak = self.problem.weak_energy
+        return weak.ends(self.x, self.problem.targets(self.t)) if weak else np.empty((0, 2, 3))
+
+    @property
+    def kinetic_energy(self) -> float:
+        """½ Σ m |v|² [J]; 0 without inertia."""
+        return 0.0 if self.v is None else 0.5 * float(self.problem.mass @ (self.v**2).sum(1))
+
+    @property
+    def momentum(self) -> np.ndarray:
+        """Σ m v [kg m/s], (3,)."""
+        return np.zeros(3) if self.v is None else self.problem.mass @ self.v
+
+    @property
+    def angular_momentum(self) -> np.ndarray:
+        """Σ m x × v about the origin [kg m²/s], (3,)."""
+        return np.zeros(3) if self.v is None else self.problem.mass @ np.cross(self.x, self.v)
 
 
 def solve(
@@ -62,22 +96,41 @@ def simulate(
     fps: float = 30.0,
     start: np.ndarray | None = None,
     monitor: Monitor | None = None,
+    inertia: bool = False,
+    dt: float | None = None,
+    substeps: int | None = None,
+    velocity: Any = None,
 ) -> Iterator[Frame]:
-    """Quasistatic frames: frame k is the equilibrium at time k / fps, started from frame k - 1.
+    """Frames of a scene, quasistatic or in motion.
 
-    Frame 0 is the equilibrium at time 0. Ctrl-C raises KeyboardInterrupt once the frames so far have been handed over;
-    a frame that was interrupted is not.
+    Quasistatic, frame k is the equilibrium at time k / fps, started from frame k - 1; frame 0 is that at time 0. With
+    ``inertia``, frame 0 is the start, and backward Euler goes from frame to frame; bodies may be free. Ctrl-C raises
+    KeyboardInterrupt once the frames so far have been handed over; a frame that was interrupted is not.
 
     Args:
         frames: Number of frames, the one at time 0 included.
         fps: Frames a second [1/s].
-        scene, solver, budget, start, monitor: As for :func:`solve`; the budget is that of one frame.
+        scene, solver, budget, start, monitor: As for :func:`solve`; the budget is that of one frame, or of one step.
+        inertia: Whether masses resist acceleration.
+        dt: Longest time step [s]; a frame is divided into as few equal steps as that takes. By default one.
+        substeps: Instead, how many steps a frame has.
+        velocity: At the start [m/s], (3,) for all vertices or (n_vert, 3); by default rest.
+
+    Raises:
+        InputError: Something given cannot be used, or a free vertex has no mass where there is inertia.
     """
-    if frames < 1 or not fps > 0:
+    if frames < 1 or not (math.isfinite(fps) and fps > 0):
         raise InputError(f"simulate: frames must be at least 1 and fps positive, not {frames} and {fps}")
-    problem = scene.compile() if isinstance(scene, Scene) else scene
+    if not inertia and not (dt is None and substeps is None and velocity is None):
+        raise InputError("simulate: dt, substeps and velocity are for inertia=True")
+    problem = scene.compile(free=inertia) if isinstance(scene, Scene) else scene
     x, budget = _start(problem, start), budget or Budget()
-    return _frames((solver or default_solver(budget)).set_up(problem), x, budget, frames, fps, monitor)
+    solver = solver or default_solver(budget)
+    if inertia:
+        steps = steps_of(fps, dt, substeps)
+        moving = BackwardEuler(problem, solver, 1 / (fps * steps), x, velocities(problem, velocity))
+        return _moving_frames(moving, steps, budget, frames, monitor)
+    return _frames(solver.set_up(problem), x, budget, frames, fps, monitor)
 
 
 def default_solver(budget: Budget) -> Solver:
@@ -99,6 +152,18 @@ def _frames(
         result = _timed(method, result) if k == 0 else result
         yield Frame(k, t, result.x, result, method.problem)
         x = result.x
+
+
+def _moving_frames(
+    moving: BackwardEuler, steps: int, budget: Budget, frames: int, monitor: Monitor | None
+) -> Iterator[Frame]:
+    first = _timed(moving.method, moving.look())
+    yield Frame(0, 0.0, moving.x, first, moving.problem, moving.v)
+    for k in range(1, frames):
+        result = moving.advance(steps, budget, monitor)
+        if result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        yield Frame(k, moving.t, result.x, result, moving.problem, moving.v)
 
 
 def _equilibrium(method: Method, x: np.ndarray, t: float, budget: Budget, monitor: Monitor | None) -> Result:

@@ -118,7 +118,7 @@ class Problem:
 
     def targets(self, t: float) -> np.ndarray:
         """Those of the weak constraints at time t [s], (k, 3) [m]; the targets of inertia are not functions of time."""
-        places = [w.targets(t) for w in self.weak[: None if self.dt is None else -1] if w.targets]
+        places = [w.targets(t) for w in self.weak if w.targets and w.targets is not _passed]
         return np.concatenate([np.empty((0, 3)), *places])
 
     def dynamic(self, dt: float) -> "Problem":
@@ -133,7 +133,7 @@ class Problem:
             raise InputError(f"dt must be positive and finite, not {dt}")
         free = np.flatnonzero(~self.fixed)
         if len(free) == 0:
-            return replace(self, dt=float(dt), weak=(*self.weak,))
+            return replace(self, dt=float(dt))
         light = free[self.mass[free] <= 0]
         if len(light):
             raise InputError(f"inertia: vertex {light[0]} has no mass; give its material a density")

@@ -16,7 +16,9 @@ class Recipe:
         frames: Frames, the one at time 0 included; by default as many as it takes for every motion to end.
         fps: Frames a second [1/s].
         solver: Who solves it; by default whoever suits the budget (:func:`pbng.drivers.default_solver`).
-        budget: What each frame may take.
+        budget: What each frame may take; with inertia, each step.
+        inertia: Whether it moves, by backward Euler, instead of being at rest in every frame.
+        dt, substeps: Longest time step [s], or steps a frame, as :func:`pbng.simulate` takes them.
     """
 
     scene: Scene
@@ -24,6 +26,9 @@ class Recipe:
     fps: float = 30.0
     solver: Solver | None = None
     budget: Budget = field(default_factory=Budget)
+    inertia: bool = False
+    dt: float | None = None
+    substeps: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, Scene):

@@ -11,7 +11,7 @@ before it has frames and unmarked after it has lost them, so no order of events 
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -46,7 +46,8 @@ class StoredFrame:
     """A frame read back: positions x [m] (n_vert, 3) at time t [s], with what the solver said of it.
 
     ``residuals`` [N] (k,) are those of the iterations ``monitored`` (k,), ``energy`` is in J, ``seconds`` [s] the
-    solver's time.
+    solver's time. If the run had inertia there are velocities v [m/s] (n_vert, 3), and if it had weak constraints there
+    are ``springs`` [m] (m, 2, 3), their ends.
     """
 
     index: int
@@ -59,6 +60,8 @@ class StoredFrame:
     energy: float
     seconds: float
     inverted: int
+    v: np.ndarray | None = field(default=None, repr=False)
+    springs: np.ndarray | None = field(default=None, repr=False)
 
 
 class FrameWriter:
@@ -148,6 +151,7 @@ class FrameWriter:
             energy=np.float64(result.energy),
             seconds=np.float64(result.seconds),
             inverted=np.int64(result.inverted),
+            **{name: a for name, a in _further(frame) if len(a)},
         )
         try:
             if self._n_vert is None:
@@ -257,6 +261,13 @@ def _manifest(file: Path) -> dict[str, Any]:
     for key in ("pbng", "created", "name", "fps", "bodies", "info"):
         manifest[key]  # a KeyError names it
     return manifest
+
+
+def _further(frame: Any) -> Iterator[tuple[str, np.ndarray]]:
+    """What only some frames have."""
+    for name in ("v", "springs"):
+        if getattr(frame, name, None) is not None:
+            yield name, np.asarray(getattr(frame, name))
 
 
 def _frame(file: Path) -> StoredFrame:
