@@ -102,6 +102,9 @@ class WeakEnergy:
         entries = np.concatenate(weight), (np.concatenate(row), np.concatenate(column))
         self.weights = scipy.sparse.csr_matrix(entries, (first, n))
         self.K = np.concatenate([c.K for c in constraints])
+        self.k = self.K[:, 0, 0].copy()
+        same = (self.k[:, None, None] * np.eye(3) == self.K).all((1, 2))  # in all directions: a number will do
+        self.directed = np.flatnonzero(~same)
         self.anchored = np.concatenate(anchored) if anchored else np.empty(0, int)
 
     def gaps(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -118,12 +121,18 @@ class WeakEnergy:
     def energy(self, x: np.ndarray, targets: np.ndarray) -> float:
         """½ Σ Cᵀ K C [J]."""
         C = self.gaps(x, targets)
-        return 0.5 * float(np.einsum("mi,mij,mj->", C, self.K, C, optimize=True))
+        return 0.5 * float(np.vdot(C, self._pull(C)))
 
     def forces(self, x: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, float]:
         """Forces (n, 3) [N], Eq. (31), and the sum of the norms of all constraints' forces [N]."""
-        pull = np.einsum("mij,mj->mi", self.K, self.gaps(x, targets))
+        pull = self._pull(self.gaps(x, targets))
         return -(self._spread @ pull), float((np.linalg.norm(pull, axis=1) * self._reach).sum())
+
+    def _pull(self, C: np.ndarray) -> np.ndarray:
+        """K C (m, 3) [N]."""
+        pull = self.k[:, None] * C
+        pull[self.directed] = np.einsum("mij,mj->mi", self.K[self.directed], C[self.directed])
+        return pull
 
     @cached_property
     def _spread(self) -> scipy.sparse.csr_matrix:
@@ -137,14 +146,12 @@ class WeakEnergy:
     def hessian(self, U: scipy.sparse.csr_matrix | None = None) -> scipy.sparse.bsr_matrix:
         """Hessian [N/m] in blocks of 3x3, (3 n, 3 n), or U'HU for interpolation weights U (n, k): it is constant."""
         W = (self.weights if U is None else self.weights @ U).tocsr()
-        k, unit = self.K[:, 0, 0], np.eye(3)
-        same = (k[:, None, None] * unit == self.K).all((1, 2))  # the same in all directions: numbers for blocks will do
-        A = W[same]
-        total = _blocks(A.T @ scipy.sparse.diags(k[same]) @ A, unit)
-        if not same.all():
-            B = _blocks(W[~same], unit)
-            m = B.shape[0] // 3
-            K = scipy.sparse.bsr_matrix((self.K[~same], np.arange(m), np.arange(m + 1)), shape=(3 * m, 3 * m))
+        k, unit, m = self.k.copy(), np.eye(3), len(self.directed)
+        k[self.directed] = 0
+        total = _blocks(W.T @ scipy.sparse.diags(k) @ W, unit)
+        if m:
+            B = _blocks(W[self.directed], unit)
+            K = scipy.sparse.bsr_matrix((self.K[self.directed], np.arange(m), np.arange(m + 1)), shape=(3 * m, 3 * m))
             total = total + B.T.tobsr((3, 3)) @ (K @ B)
         return total.tobsr((3, 3))
 
