@@ -144,19 +144,20 @@ def test_bad_budgets_are_named(limits, word):
 
 
 def test_float32_ends_at_its_floor(bar):
-    """Asked for more than float32 can give, the solve says so instead of going on; float64 gets there."""
+    """Asked for more than float32 can give, the solve says so instead of going on; float64 and "auto" get there."""
     budget = pbng.Budget(rtol=1e-12, iterations=2000)
-    result = pbng.solve(bar, pbng.PBNG(), budget)
+    result = pbng.solve(bar, pbng.PBNG(dtype="float32"), budget)
     assert result.status is pbng.Status.PRECISION
     assert result.status.ok
     assert result.iterations < 1000
     assert result.reduction < 1e-4
-    assert pbng.solve(bar, DOUBLE, budget).status is pbng.Status.CONVERGED
+    for solver in (DOUBLE, pbng.PBNG()):
+        assert pbng.solve(bar, solver, budget).status is pbng.Status.CONVERGED
 
 
 def test_float32_and_float64_agree(bar):
     """Both precisions reach the same equilibrium; residuals are float64 in both."""
-    single = pbng.solve(bar, pbng.PBNG(), pbng.Budget(rtol=1e-4))
+    single = pbng.solve(bar, pbng.PBNG(dtype="float32"), pbng.Budget(rtol=1e-4))
     double = pbng.solve(bar, DOUBLE, pbng.Budget(rtol=1e-8))
     assert np.abs(single.x - double.x).max() < 1e-3
     assert single.residuals.dtype == np.float64

@@ -206,3 +206,13 @@ def test_compounds_carry_what_is_tied_to_them():
         for weak in problem.weak:
             mine = (weak.vertices == leader).any(1)
             np.testing.assert_allclose((weak.weights * beta[weak.vertices]).sum(1)[mine], 0, atol=1e-14)
+
+
+@pytest.mark.parametrize("solver", [pbng.PBNG(), pbng.MultigridPBNG()])
+def test_stiff_springs_without_a_gap_are_not_taken_for_rest(solver):
+    """Rounding them to float32 makes forces above the weight; the default precision sees to it."""
+    problem = two_blocks(1e8, n=4)
+    problem = replace(problem, X=problem.X - np.where(np.arange(problem.n_vert) < 64, 0.1, 0)[:, None] * [0, 1, 0])
+    result = pbng.solve(problem, solver, pbng.Budget(rtol=1e-5, iterations=300), start=problem.X)
+    assert result.status is pbng.Status.CONVERGED
+    assert result.iterations > 2

@@ -35,7 +35,7 @@ class PBNG:
 
     acceleration: Any = field(default_factory=Anderson)
     block: str = "majorizer"
-    dtype: Any = "float32"
+    dtype: Any = "auto"
     symmetric: bool = False
     threads: int | None = None
     device: str = "cpu"
