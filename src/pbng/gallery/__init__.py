@@ -73,6 +73,20 @@ _ENTRIES = (
         "vertices across the bar, 9",
     ),
     Entry(
+        "two_blocks_hanging",
+        "pbng.gallery.hanging",
+        "Fig. 17",
+        "A block hangs below another, bound by stiff springs that close a gap.",
+        "vertices along an edge of each block, 16",
+    ),
+    Entry(
+        "swinging_block",
+        "pbng.gallery.hanging",
+        "Fig. 3",
+        "A block at a wall falls under gravity and swings (with inertia).",
+        "vertices along an edge, 16",
+    ),
+    Entry(
         "bent_surface",
         "pbng.gallery.gravity",
         "",
