@@ -16,11 +16,11 @@ from pbng.view.stretch import Stretch
 from pbng.view.surface import Motion, Surface, creased
 
 pytest.importorskip("pyvista")
-pytest.importorskip("imageio_ffmpeg")
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 Image = pytest.importorskip("PIL.Image")
 
 from pbng import view as views  # noqa: E402
-from pbng.view import colors, render, shadow  # noqa: E402
+from pbng.view import colors, render, shadow, springs  # noqa: E402
 from pbng.view.occlusion import occlude  # noqa: E402
 
 SIZE = (320, 180)
@@ -239,8 +239,6 @@ def test_not_finite_positions_are_no_disaster(tmp_path):
 
 
 def test_films_have_every_frame(run, tmp_path, capfd):
-    import imageio_ffmpeg
-
     path = views.film(run, tmp_path / "a.mp4", size=(161, 120), color="body")
     reader = imageio_ffmpeg.read_frames(str(path))
     facts = next(reader)
@@ -322,6 +320,94 @@ def test_bad_input_is_named(run, tmp_path):
         views.picture(run, tmp_path / "a.xyz", size=SIZE)
     with pytest.raises(InputError, match=r"cannot write .*a\.xyz"):
         views.film(run, tmp_path / "a.xyz", size=SIZE)
+
+
+def two_boxes(gap, lines=None):
+    """Frames of a box that sinks that far [m] below another, with the springs (m, 2, 3) between them or others."""
+    upper, lower = box(at=(0, 1, 0)), box()
+    made = list(frames([upper, lower], 3, lambda X, s: X - [0, gap * s * (X[:, 1].min() == 0), 0]))
+    for frame in made:
+        below = frame.x[len(upper.X) :][lower.X[:, 1] == 1]
+        tied = np.stack([upper.X[upper.X[:, 1] == 1], below], axis=1)
+        frame.springs = tied if lines is None else np.array(lines, float)
+    return made
+
+
+def green(image):
+    """Pixels that springs cover for a good part; no body here is green, blues and greys are not."""
+    return image[..., 1] - image[..., [0, 2]].max(2) > 25
+
+
+def drawn(source, tmp_path, size=(480, 480), **options):
+    return read(views.picture(source, tmp_path / "a.png", size=size, color="body", **options))
+
+
+def test_springs_are_seen_between_what_they_tie(tmp_path):
+    made = two_boxes(0.5)
+    image = drawn(made, tmp_path)
+    rows, columns = np.nonzero(green(image))
+    assert 150 < rows.min() < rows.max() < 330, "in the gap"
+    least, most = np.flatnonzero(body_pixels(image).any(0))[[0, -1]]
+    assert least - 2 <= columns.min() < least + 60 < most - 60 < columns.max() <= most + 2
+    with FrameWriter(tmp_path / "run") as out:
+        for frame in made:
+            out.write(frame)
+    assert np.array_equal(drawn(tmp_path / "run", tmp_path), image)
+    strip = green(read(views.sheet(Run(tmp_path / "run"), tmp_path / "b.png", 3, width=900, color="body")))
+    thirds = [part.sum() for part in np.array_split(strip, 3, axis=1)]
+    assert thirds[2] > thirds[1] > 30, "they grow"
+    reader = imageio_ffmpeg.read_frames(str(views.film(made, tmp_path / "a.mp4", size=(480, 480), color="body")))
+    next(reader)
+    last = [np.frombuffer(data, np.uint8).reshape(480, 480, 3).astype(int) for data in reader][-1]
+    assert green(last).sum() > 0.5 * len(rows)
+
+
+def test_without_springs_nothing_changes(tmp_path):
+    made = two_boxes(0.5, np.empty((0, 2, 3)))
+    empty = drawn(made, tmp_path)
+    for frame in made:
+        del frame.springs
+    assert np.array_equal(drawn(made, tmp_path), empty)
+    for end in (0.5, np.nan):
+        vanished = drawn(two_boxes(0.5, [[[0.5, 0.5, 0.5], [0.5, 0.5, end]]]), tmp_path)
+        assert np.abs(vanished - empty).mean() < 0.1, "but for rounding in where the camera stands"
+        assert not green(vanished).any()
+
+
+def test_springs_are_hidden_by_what_is_before_them(tmp_path):
+    front, side = [[0, 0, 1], [1, 0, 1]], [[1, 1, 0.2], [2, 1, -0.8]]  # seen from the z axis, turned towards x
+    seen = [green(drawn(two_boxes(0, [line]), tmp_path)).sum() for line in (np.add(front, [0, 1.5, 0]), side)]
+    assert min(seen) > 50, "what lies in a surface or beside it is seen"
+    inside, behind = [[0.2, 1.2, 0.2], [0.8, 1.8, 0.8]], [[0, 1.2, -0.2], [0.4, 1.5, -0.2]]
+    assert not green(drawn(two_boxes(0, [inside, behind]), tmp_path)).any()
+    plane = next(frames([sheet(4)], 1, lambda X, s: X))
+    for z, least, most in ((0.0, 60, 200), (-0.1, 0, 0)):
+        plane.springs = np.array([[[-0.4, -0.3, z], [0.4, 0.3, z]]])
+        assert least <= green(drawn(plane, tmp_path, (120, 120))).sum() <= most
+
+
+def test_springs_that_end_far_away_are_framed(tmp_path):
+    motion = Motion.of(made := two_boxes(0.5, [[[1, 2, 1], [4, 5, 1]], [[0, 2, 0], [np.inf, 0, 0]]]))
+    extent = Extent.of(motion, Surface(motion))
+    assert np.allclose(extent.high, [4, 5, 1])
+    assert np.allclose(extent.bodies.high, [1, 2, 1])
+    image = drawn(made, tmp_path)
+    assert_well_framed(image, (480, 480), least=0.02)
+    assert green(image[:160, 320:]).sum() > 30
+
+
+def test_of_very_many_springs_some_are_drawn(tmp_path):
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 50)], [0.0, 0.0]), axis=-1).reshape(-1, 3)
+    lines = np.stack([grid, grid + np.array([0, 0, 3])], axis=1)
+    chosen = np.unique(springs.apart(lines, springs.MOST))
+    assert len(chosen) == springs.MOST
+    counts = np.histogram2d(*grid[chosen, :2].T, bins=4)[0]
+    assert counts.min() > 0.6 * counts.max(), "evenly"
+    assert np.array_equal(springs.apart(lines[:7], 7), range(7))
+    assert len(np.unique(springs.apart(np.zeros((900, 2, 3)), 500))) == 500
+    image = drawn(two_boxes(0.0, lines), tmp_path)
+    assert green(image).sum() > 500
+    assert not (np.abs(image - springs.COLOR).sum(2) < 15).any(), "what is behind them shows through"
 
 
 def test_residuals_are_plotted(tmp_path):

@@ -5,26 +5,42 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbng.view.surface import Motion, Surface
+from pbng.view.surface import Motion, Surface, springs_of
 
 VIEW_ANGLE = 18.0  # [degrees] from the bottom to the top of the picture: a long lens, for calm perspective
 
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """What a motion sweeps: the outermost points (n, 3) [m] of its surface over all frames."""
+    """What a motion sweeps: the outermost points (n, 3) [m] of it over all frames.
+
+    Attributes:
+        points: Those of its surface, followed by the ends of weak constraints.
+        n_ends: How many ends there are.
+    """
 
     points: np.ndarray
+    n_ends: int = 0
 
     @classmethod
     def of(cls, motion: Motion, surface: Surface) -> "Extent":
         """Looks through all frames once."""
         directions = _directions(96)
-        outermost = []
+        outermost, ends = [], [np.empty((0, 3))]
         for k in range(len(motion)):
-            points = surface.points(motion.frames[k].x)
-            outermost.append(points[np.unique((points @ directions.T).argmax(0))])
-        return cls(np.concatenate(outermost).astype(np.float64))
+            frame = motion.frames[k]
+            outermost.append(_outermost(surface.points(frame.x), directions))
+            springs = springs_of(frame).astype(np.float32)
+            springs = springs[np.isfinite(springs).all((1, 2))].reshape(-1, 3)
+            if len(springs):
+                ends.append(_outermost(springs, directions))
+        tied = np.concatenate(ends)
+        return cls(np.concatenate([*outermost, tied]).astype(np.float64), len(tied))
+
+    @property
+    def bodies(self) -> "Extent":
+        """What the surface alone sweeps."""
+        return Extent(self.points[: len(self.points) - self.n_ends])
 
     @property
     def low(self) -> np.ndarray:
@@ -50,6 +66,21 @@ class Camera:
     focus: np.ndarray
     up: np.ndarray
     parallel: float | None = None
+
+    @property
+    def frame(self) -> np.ndarray:
+        """Its right, up and back as rows (3, 3)."""
+        back = self.position - self.focus
+        back = back / np.linalg.norm(back)
+        return np.stack([np.cross(self.up, back), self.up, back])
+
+    def seen(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Column and row [pixels] in a picture of the size, and depth [m] along the camera's axis, of points (n, 3)."""
+        right, up, back = ((points - self.position) @ self.frame.T).T
+        half = np.full_like(back, self.parallel) if self.parallel else -back * np.tan(np.radians(VIEW_ANGLE) / 2)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of what is beside the camera
+            column, row = size[0] + size[1] * right / half, size[1] - size[1] * up / half
+        return np.stack([column / 2, row / 2, -back], axis=1)
 
 
 def framed(
@@ -110,6 +141,11 @@ def _between(across: np.ndarray, depth: np.ndarray, low: float, high: float) -> 
     beyond_high, beyond_low = (across - high * depth).max(), (-across - low * depth).max()
     nearest = -(beyond_high + beyond_low) / (high + low)
     return lambda z: (beyond_high + high * z - beyond_low - low * z) / 2, float(nearest)
+
+
+def _outermost(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Those of the points (n, 3) that lie farthest in one of the directions."""
+    return points[np.unique((points @ directions.T).argmax(0))]
 
 
 def _directions(n: int) -> np.ndarray:

@@ -14,8 +14,9 @@ from pbng.io.frames import Run
 from pbng.view.camera import Extent, facing, framed, projected_aspect
 from pbng.view.colors import Paint, stretch_map
 from pbng.view.plots import caption, color_bar, over, plot_residuals
+from pbng.view.springs import Springs
 from pbng.view.stage import Floor, Stage
-from pbng.view.surface import Motion, Surface
+from pbng.view.surface import Motion, Surface, springs_of
 from pbng.view.video import Video
 
 MARGIN = 0.07
@@ -34,6 +35,8 @@ def picture(
     elevation: float = 20.0,
 ) -> Path:
     """Draw one frame as a picture; returns its path.
+
+    Weak constraints are thin lines between what they tie together; of thousands, some hundred are drawn.
 
     Args:
         source: A run or its folder, a frame or a sequence of frames, a mesh or a sequence of meshes at rest, or a pair
@@ -143,6 +146,7 @@ class _Artist:
         self.extent = Extent.of(motion, self.surface)
         self.reach = 0.4 * float(np.median([np.linalg.norm(np.ptp(body.mesh.X, axis=0)) for body in motion.bodies]))
         self.paint = Paint(self.surface, motion, color)
+        self.springs = Springs(springs_of(motion.frames[0]))
         self._bar: np.ndarray | None = None
 
     def stage(self, size: tuple[int, int], *, tile: bool = False, sampling: int = 3) -> Stage:
@@ -158,7 +162,16 @@ class _Artist:
             azimuth, elevation = self.angles
             camera = framed(self.extent, aspect, azimuth=azimuth, elevation=elevation, margins=margins)
             floor, reach = self._floor(tile), self.reach
-        return Stage(self.surface, camera, size, floor=floor, reach=reach, edges=self.edges, sampling=sampling)
+        return Stage(
+            self.surface,
+            camera,
+            size,
+            floor=floor,
+            reach=reach,
+            edges=self.edges,
+            sampling=sampling,
+            springs=self.springs,
+        )
 
     def aspect(self) -> float:
         """Width over height of what the motion covers in a picture."""
@@ -169,7 +182,7 @@ class _Artist:
 
     def draw(self, stage: Stage, frame: Any, bar: bool = True) -> np.ndarray:
         """The image (height, width, 3) uint8 of a frame."""
-        image = stage(frame.x, self.paint(frame.x))
+        image = stage(frame.x, self.paint(frame.x), springs_of(frame))
         return self.with_bar(image, image.shape[0] / 720) if bar else image
 
     def with_bar(self, image: np.ndarray, unit: float) -> np.ndarray:
@@ -181,9 +194,11 @@ class _Artist:
         return over(image, self._bar)
 
     def _floor(self, tile: bool) -> Floor:
-        low, high = self.extent.low, self.extent.high
+        bodies = self.extent.bodies  # springs cast no shadow, but the floor is below them too
+        low, high = bodies.low, bodies.high
+        low[1] = self.extent.low[1]
         centre = (low + high) / 2
-        centre[1] = low[1] - 2e-3 * self.extent.size  # below what lies on it, or the two would mix
+        centre[1] = low[1] - 2e-3 * bodies.size  # below what lies on it, or the two would mix
         reach = np.hypot(*(high - low)[[0, 2]]) / 2
         floor = Floor(centre, 1.6 * reach + 1.1 * (high - low)[1], float(high[1] - centre[1]))
         return replace(floor, tint=0.0) if tile else floor

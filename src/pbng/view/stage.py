@@ -10,6 +10,7 @@ from pbng.view.camera import VIEW_ANGLE, Camera
 from pbng.view.light import Light
 from pbng.view.occlusion import occlude
 from pbng.view.shadow import PIXELS, Shadow
+from pbng.view.springs import Springs
 from pbng.view.surface import Surface
 from pbng.view.window import INK, Window
 
@@ -37,6 +38,7 @@ class Stage:
         reach: How far [m] surfaces take light from each other; 0 for no such shading.
         edges: Whether to draw the edges of the triangles.
         sampling: Each pixel is the mean of so many by so many.
+        springs: What draws weak constraints.
 
     Raises:
         InputError: pyvista is not installed, or the machine has nothing to draw with.
@@ -52,12 +54,11 @@ class Stage:
         reach: float,
         edges: bool,
         sampling: int,
+        springs: Springs,
     ) -> None:
         self.surface, self.sampling, self.reach = surface, sampling, reach
         n, triangles = len(surface.source), surface.triangles
-        back = camera.position - camera.focus
-        back = back / np.linalg.norm(back)
-        self.frame = np.stack([np.cross(camera.up, back), camera.up, back])
+        self.camera, self.frame, self.springs = camera, camera.frame, springs
         # A plane seen face on has no shape to model by light.
         self.light = Light(self.frame) if camera.parallel is None else None
         large = sampling * size[0], sampling * size[1]
@@ -66,8 +67,10 @@ class Stage:
         self.guide = Window(n, triangles, camera, ((size[0] + 1) // 2, (size[1] + 1) // 2)) if reach > 0 else None
         self.shadow = None if floor is None else self._lay(floor)
 
-    def __call__(self, x: np.ndarray, color: np.ndarray) -> np.ndarray:
-        """The image of the surface when the bodies are at x (n_vert, 3), its points having the colours (n, 3) uint8."""
+    def __call__(self, x: np.ndarray, color: np.ndarray, springs: np.ndarray) -> np.ndarray:
+        """The image of the surface when the bodies are at x (n_vert, 3), its points having the colours (n, 3) uint8,
+        and of weak constraints with ends (m, 2, 3) [m].
+        """
         points = self.surface.points(x)
         normals = self.surface.normals(points)
         if self.shadow is not None:
@@ -78,6 +81,7 @@ class Stage:
             lit = (np.minimum(color * self.light(side), 255).astype(np.uint8) for side in (normals, -normals))
             self.window.draw(points, *lit)
         image = _shrunk(self.window.image(), self.sampling)
+        fine = self.window.depth() if len(springs) else None  # before anything else is drawn
         if self.guide is not None:
             seen = normals @ self.frame.T
             self.guide.draw(points, *(np.rint(127.5 * (side + 1)).astype(np.uint8) for side in (seen, -seen)))
@@ -85,6 +89,8 @@ class Stage:
             step = self.surface.edge
             depth = self.window.depth(self.sampling)
             occlude(image, depth, self.guide.depth(), self.guide.image(), tangent, self.reach, step)
+        if fine is not None:
+            self.springs.draw(image, fine, self.camera, springs)
         return image
 
     def close(self) -> None:

@@ -89,6 +89,12 @@ class Motion:
         return all(bool(np.ptp(self.frames[k].x[:, 2]) == 0) for k in range(len(self)))
 
 
+def springs_of(frame: Any) -> np.ndarray:
+    """The two ends (m, 2, 3) [m] of each weak constraint of a frame, which need not know of any."""
+    springs = getattr(frame, "springs", None)
+    return np.empty((0, 2, 3)) if springs is None else np.asarray(springs, np.float64)
+
+
 def _bodies(meshes: Sequence[Any]) -> list[_Body]:
     stops = np.cumsum([len(mesh.X) for mesh in meshes])
     return [_Body(f"body {k}", int(e) - len(m.X), int(e), m) for k, (m, e) in enumerate(zip(meshes, stops))]

@@ -93,6 +93,8 @@ class Window:
         self.plotter.ren_win.GetZbufferData(0, 0, width - 1, height - 1, data)
         z = vtk_to_numpy(data).reshape(height, width)[::-1][every // 2 :: every, every // 2 :: every]
         near, far = self.plotter.camera.clipping_range
+        if self.plotter.camera.parallel_projection:
+            return np.where(z < 1, near + z * (far - near), np.inf).astype(np.float32)
         return np.where(z < 1, near * far / (far - z * (far - near)), np.inf).astype(np.float32)
 
     def close(self) -> None:
