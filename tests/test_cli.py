@@ -259,3 +259,15 @@ def test_help_needs_nothing_heavy():
     loaded = "import sys, pbng.cli; print(sorted({'numba', 'numpy', 'scipy', 'pyvista'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_inertia_from_the_command_line(pbng_):
+    code, said = pbng_("run hanging_bar --resolution 3 --inertia --frames 3 --dt 0.02")
+    assert code == 0, said
+    assert "kinetic" in said
+    assert "momentum" in said
+    run = pbng.read_run("runs/hanging_bar")
+    assert np.abs(run[2].v).max() > 0
+    code, said = pbng_("run hanging_bar --resolution 3 --dt 0.02")
+    assert code == 1
+    assert "--dt and --substeps are for runs with --inertia" in said

@@ -19,6 +19,8 @@ COURSE = [
     ("07_plane_strain", 1.0, 0.003, [], []),
     ("08_accelerations", 8.0, 3.5, ["residuals.png"], ["matplotlib"]),  # sweeps over sweeps
     ("09_labels_to_trust", 1.0, 0.0, [], []),  # all of them
+    ("10_springs", 1.0, 0.01, [], []),
+    ("11_motion", 1.0, 1e-3, [], []),
 ]
 
 

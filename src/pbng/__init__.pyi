@@ -1,6 +1,7 @@
 """The public names: what type checkers read, and what ``__init__.py`` loads lazily."""
 
 from . import gallery as gallery, linalg as linalg, shapes as shapes, view as view
+from .bodies import Body as Body, Points as Points, Selection as Selection
 from .drivers import Frame as Frame, default_solver as default_solver, simulate as simulate, solve as solve
 from .errors import InputError as InputError
 from .io.export import export as export
@@ -18,10 +19,13 @@ from .mesh_quality import quality as quality
 from .meshing import creature as creature, tetrahedralize as tetrahedralize
 from .motions import Animation as Animation, Motion as Motion, Rotate as Rotate, Scale as Scale, Translate as Translate
 from .problem import Problem as Problem
-from .scene import Body as Body, Scene as Scene, Selection as Selection
+from .scene import Scene as Scene
 from .solvers.acceleration import SOR as SOR, Anderson as Anderson, Chebyshev as Chebyshev, NodeSOR as NodeSOR
 from .solvers.base import Budget as Budget, Progress as Progress, Result as Result, Status as Status
+from .solvers.linear import AMG as AMG, CG as CG, BiCGSTAB as BiCGSTAB, Direct as Direct, GaussSeidel as GaussSeidel
 from .solvers.multigrid import MultigridPBNG as MultigridPBNG
+from .solvers.newton import Newton as Newton
 from .solvers.pbng import PBNG as PBNG
+from .solvers.xpbd import PBD as PBD, XPBD as XPBD
 
 __version__: str

@@ -1,4 +1,4 @@
-"""The command line: ``pbng run``, ``demo``, ``list``, ``info``, ``view``, ``export``, ``bench``.
+"""The command line: ``pbng run``, ``compare``, ``demo``, ``list``, ``info``, ``view``, ``export``, ``bench``.
 
 What is heavy is imported inside the commands, so that ``pbng --help`` answers at once.
 """
@@ -59,7 +59,8 @@ def run(
     solver: Annotated[
         str | None,
         typer.Option(
-            help="auto, multigrid, anderson, plain, node-sor, sor, chebyshev; parameters after a colon: anderson:5."
+            help="auto, multigrid, anderson, plain, node-sor, sor, chebyshev, newton, xpbd, pbd; parameters after a colon:"
+            " anderson:5."
         ),
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="At most so many iterations a frame.")] = None,
@@ -71,6 +72,12 @@ def run(
     threads: Annotated[int | None, typer.Option(help="Threads to use; by default all.")] = None,
     frames: Annotated[int | None, typer.Option(help="Frames, the one at time 0 included.")] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
+    inertia: Annotated[
+        bool | None,
+        typer.Option("--inertia/--quasistatic", help="Backward Euler, or equilibria; by default as the scene says."),
+    ] = None,
+    dt: Annotated[float | None, typer.Option(help="With inertia: longest time step [s].")] = None,
+    substeps: Annotated[int | None, typer.Option(help="With inertia: steps a frame.")] = None,
     to: Annotated[Path | None, typer.Option("--out", help="Folder of the run; by default runs/NAME.")] = None,
     overwrite: Overwrite = False,
     view: Annotated[bool, typer.Option("--view/--no-view", help="Draw pictures and a film when it is done.")] = False,
@@ -89,7 +96,7 @@ def run(
         recipe.budget, iterations=iterations, seconds=seconds, rtol=rtol, atol=atol, error=error
     )
     report = cli_run.run(
-        recipe,
+        cli_options.in_motion(recipe, inertia, dt, substeps),
         to or Path("runs") / name,
         solver=cli_options.solver(recipe.solver, budget, solver, dtype, threads),
         budget=budget,
@@ -110,6 +117,43 @@ def run(
 
 
 @app.command()
+def compare(
+    scene: Annotated[
+        str, typer.Argument(metavar="NAME|FILE.py", help="A scene of `pbng list`, or a file with scene().")
+    ],
+    surface: Annotated[
+        Path | None, typer.Argument(metavar="MESH", help="A file for scenes that take one, such as bent_surface.")
+    ] = None,
+    resolution: Annotated[
+        int | None, typer.Option(help="What it counts depends on the scene.", show_default=False)
+    ] = None,
+    methods: Annotated[
+        str | None,
+        typer.Option(help="Separated by commas: pbng, and the words of `pbng run --solver`.", show_default=False),
+    ] = None,
+    iterations: Annotated[int | None, typer.Option(help="At most so many iterations of each.", min=1)] = None,
+    seconds: Annotated[float | None, typer.Option(help="At most so many seconds of solving by each; or 4.")] = None,
+    at: Annotated[float | None, typer.Option(help="Time of the motions [s]; by default their end.")] = None,
+    hard: Annotated[bool, typer.Option("--hard", help="Start with free vertices scattered at random.")] = False,
+    seed: Annotated[int, typer.Option(help="Of --hard.")] = 0,
+    rounds: Annotated[int, typer.Option(help="Times are medians over so many rounds.", min=1)] = 1,
+    threads: Annotated[int | None, typer.Option(help="Threads to use; by default all.")] = None,
+    to: Annotated[Path | None, typer.Option("--out", help="Folder to write; by default comparisons/NAME.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Write the record to this JSON file, too.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
+    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw plots and final states.")] = True,
+) -> None:
+    """Compare methods on one scene: one start, one residual, one clock. See docs/comparing.md."""
+    from pbng.cli_compare import compare
+
+    compare(
+        scene, surface, resolution=resolution, methods=methods, iterations=iterations, seconds=seconds, at=at,
+        hard=hard, seed=seed, rounds=rounds, threads=threads, to=to, record=record, overwrite=overwrite,
+        pictures=pictures,
+    )  # fmt: skip
+
+
+@app.command()
 def demo(
     to: Annotated[Path, typer.Option("--out", help="Folder for runs and pictures.")] = Path("runs/demo"),
     resolution: Annotated[int, typer.Option(help="Vertices along an edge of the twisting block.")] = 24,
@@ -118,6 +162,24 @@ def demo(
     from pbng.cli_demo import demo
 
     demo(to, resolution)
+
+
+@app.command("reproduce")
+def reproduce(
+    names: Annotated[
+        list[str], typer.Argument(metavar="NAME...|all", help="Figures and tables of the paper, such as fig7 table1.")
+    ],
+    size: Annotated[
+        str, typer.Option(help="small: seconds each; medium: minutes; paper: the paper's sizes, hours in all.")
+    ] = "medium",
+    to: Annotated[Path, typer.Option("--out", help="Folder of the page.")] = Path("runs/reproduce"),
+    threads: Annotated[int | None, typer.Option(help="Threads of every method; by default as many as help.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Run the paper's figures and tables again: pictures, and the paper's numbers beside ours, on one page."""
+    from pbng.cli_reproduce import reproduce
+
+    reproduce(names, to, size, threads, overwrite)
 
 
 @app.command("list")

@@ -18,7 +18,9 @@ from pbng.scene import Scene
 from pbng.solvers.acceleration import SOR, Anderson, Chebyshev, NodeSOR
 from pbng.solvers.base import Budget, Solver
 from pbng.solvers.multigrid import MultigridPBNG
+from pbng.solvers.newton import Newton
 from pbng.solvers.pbng import PBNG
+from pbng.solvers.xpbd import PBD, XPBD
 
 ACCELERATIONS: dict[str, Any] = {
     "anderson": Anderson,
@@ -27,6 +29,7 @@ ACCELERATIONS: dict[str, Any] = {
     "sor": SOR,
     "chebyshev": Chebyshev,
 }
+METHODS: dict[str, Any] = {"multigrid": MultigridPBNG, "newton": Newton, "xpbd": XPBD, "pbd": PBD}
 
 
 def recipe(target: str, surface: Path | None, resolution: int | None) -> tuple[Recipe, str, Path | None]:
@@ -75,6 +78,18 @@ def _from_file(file: Path, given: Mapping[str, Any]) -> Recipe:
     return made
 
 
+def in_motion(recipe: Recipe, inertia: bool | None, dt: float | None, substeps: int | None) -> Recipe:
+    """The recipe with inertia or without, and with other time steps, where they are given."""
+    inertia = recipe.inertia if inertia is None else inertia
+    if not inertia:
+        if dt is not None or substeps is not None:
+            raise InputError("--dt and --substeps are for runs with --inertia")
+        return replace(recipe, inertia=False, dt=None, substeps=None)
+    if dt is None and substeps is None:
+        return replace(recipe, inertia=True)
+    return replace(recipe, inertia=True, dt=dt, substeps=substeps)
+
+
 def solver(default: Solver | None, budget: Budget, name: str | None, dtype: str | None, threads: int | None) -> Solver:
     """The solver that is named, or the recipe's, or the one that suits the budget, with the settings that are given."""
     chosen: Any = default or default_solver(budget)
@@ -82,14 +97,16 @@ def solver(default: Solver | None, budget: Budget, name: str | None, dtype: str 
         plain = name.strip().lower()
         if plain == "auto":
             chosen = default_solver(budget)
-        elif plain == "multigrid":
-            chosen = MultigridPBNG()
+        elif plain in METHODS:
+            chosen = METHODS[plain]()
         else:
             acceleration = parse_acceleration(name)
             chosen = replace(chosen if isinstance(chosen, PBNG) else PBNG(), acceleration=acceleration)
     given = {key: value for key, value in (("dtype", dtype), ("threads", threads)) if value is not None}
-    if given and not isinstance(chosen, PBNG | MultigridPBNG):
+    if given and not isinstance(chosen, (PBNG, *METHODS.values())):
         raise InputError(f"--dtype and --threads are not for {type(chosen).__name__}, which the scene asks for")
+    if "dtype" in given and not hasattr(chosen, "dtype"):
+        raise InputError(f"--dtype is not for {type(chosen).__name__}, which works in float64")
     return replace(chosen, **given)
 
 
@@ -102,9 +119,10 @@ def parse_acceleration(text: str) -> Any:
     name, _, values = text.partition(":")
     name = name.strip().lower().replace("_", "-")
     if name not in ACCELERATIONS:
-        near = get_close_matches(name, [*ACCELERATIONS, "auto", "multigrid"], n=1)
+        near = get_close_matches(name, [*ACCELERATIONS, "auto", *METHODS], n=1)
         hint = f"did you mean {near[0]}? " if near else ""
-        raise InputError(f"unknown solver {text!r}; {hint}known are auto, multigrid, {', '.join(ACCELERATIONS)}")
+        known = ["auto", "multigrid", *ACCELERATIONS, *(m for m in METHODS if m != "multigrid")]
+        raise InputError(f"unknown solver {text!r}; {hint}known are {', '.join(known)}")
     kind = ACCELERATIONS[name]
     words = [word for word in values.split(",") if word.strip()]
     parameters = [] if kind is None else list(fields(kind))

@@ -1,4 +1,9 @@
-"""Node colouring: nodes of one colour share no cell, so they can be updated in parallel (section 10)."""
+"""Colouring of nodes and of constraints, so that those of one colour can be updated in parallel (section 10).
+
+Nodes of one colour share no cell; constraints of one colour share no node.
+"""
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -51,6 +56,47 @@ def color_nodes(order: np.ndarray, incidences: list[tuple[np.ndarray, np.ndarray
     if stuck >= 0:
         raise InputError(f"vertex {stuck} has neighbours of {MAX_COLORS} colours: the mesh is too densely connected")
     return color
+
+
+@serial
+def _greedy_constraints(stencils, used, first, color):
+    """Give each constraint the smallest colour from ``first[0]`` on that none of its nodes has used.
+
+    ``used`` holds, for each node, 128 colours as the bits of two words; where all are used a new set begins.
+    """
+    one, word = np.uint64(1), np.uint64(63)
+    for n in range(stencils.shape[0]):
+        c = 128
+        for half in range(2):
+            taken = np.uint64(0)
+            for k in range(stencils.shape[1]):
+                taken |= used[stencils[n, k], half]
+            if ~taken:
+                c = 64 * half
+                while (taken >> (np.uint64(c) & word)) & one:
+                    c += 1
+                break
+        if c == 128:
+            used[:] = 0
+            first[0] += 128
+            c = 0
+        color[n] = first[0] + c
+        for k in range(stencils.shape[1]):
+            used[stencils[n, k], c >> 6] |= one << (np.uint64(c) & word)
+
+
+def color_constraints(stencils: Sequence[np.ndarray], n_vert: int) -> np.ndarray:
+    """Colours (n,) int32 of constraints, greedily in the given order: each gets the smallest that its nodes have left.
+
+    Args:
+        stencils: The nodes of the constraints, arrays (m, k) of as many sizes as there are; numbered through.
+        n_vert: Number of nodes.
+    """
+    used, first = np.zeros((n_vert, 2), np.uint64), np.zeros(1, np.int64)
+    colors = [np.empty(len(s), np.int32) for s in stencils]
+    for s, color in zip(stencils, colors):
+        _greedy_constraints(np.ascontiguousarray(s, np.int32), used, first, color)
+    return np.concatenate(colors) if colors else np.empty(0, np.int32)
 
 
 @serial

@@ -136,7 +136,7 @@ def pack_problem(problem: Problem, dtype=np.float32, paper_block: bool = False) 
     seg_start, seg = spans[0] if len(spans) == 1 else _merge(spans)
     seg = seg[:, :5].copy()
     return Packed(
-        slot, _origin(problem.X), n_slot, n_block, color_start, seg_start, seg, idx, coef,
+        slot, origin_of(problem.X), n_slot, n_block, color_start, seg_start, seg, idx, coef,
         _padded(nodal, real).astype(dtype).ravel(), groups.parameters, groups.functions,
         stiffness[0], stiffness[1] - stiffness[0], problem.n_target, n_color,
         _carried(compounds, place, color_start[n_color:], np.dtype(dtype)) if compounds else (),
@@ -191,7 +191,7 @@ def _fill(f: Family, span, X, owner, real, places, groups: Groups, idx, coef, no
     each(specialised(make_fill, f.packers, coef.dtype), arrays, len(span[0]) - 1, grain=64)
 
 
-def _origin(X: np.ndarray) -> np.ndarray:
+def origin_of(X: np.ndarray) -> np.ndarray:
     """The middle of a scene that lies far away, where float32 positions would lose too many digits, else zero."""
     low, high = X.min(0), X.max(0)
     far = np.abs(X).max() > 4 * (high - low).max()

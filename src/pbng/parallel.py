@@ -35,7 +35,7 @@ def run(body: Any, arrays: tuple[np.ndarray, ...], sets: np.ndarray, start: np.n
         grain: Length of the pieces of a range that are given to threads.
     """
     assert all(a.flags.c_contiguous for a in arrays), "arrays of parallel bodies must be contiguous"
-    _run(_address(body), np.array([a.__array_interface__["data"][0] for a in arrays]), sets, start, grain)
+    _run(address(body), np.array([a.__array_interface__["data"][0] for a in arrays]), sets, start, grain)
 
 
 def each(body: Any, arrays: tuple[np.ndarray, ...], n: int, grain: int = 1) -> None:
@@ -44,7 +44,8 @@ def each(body: Any, arrays: tuple[np.ndarray, ...], n: int, grain: int = 1) -> N
 
 
 @cache
-def _address(body: Any) -> int:
+def address(body: Any) -> int:
+    """Where the machine code of a body is, for :func:`call_at`; compiled if need be."""
     compiled = body.overloads.get(_SIGNATURE)
     if compiled is None:
         body.compile(_SIGNATURE)
@@ -113,7 +114,7 @@ def _(n, dtype):
 
 
 @intrinsic
-def _call(typing, function, arguments, low, high):
+def call_at(typing, function, arguments, low, high):
     """Call a body at an address; ``arguments`` is the address of the addresses of its arrays."""
 
     def generate(context, builder, signature, values):
@@ -131,4 +132,4 @@ def _run(function, arguments, sets, start, grain):
         low, high = start[sets[n]], start[sets[n] + 1]
         for piece in prange((high - low + grain - 1) // grain):
             first = low + piece * grain
-            _call(function, arguments.ctypes.data, first, min(high, first + grain))
+            call_at(function, arguments.ctypes.data, first, min(high, first + grain))

@@ -25,6 +25,19 @@ class Block(NamedTuple):
     at_rest: bool = False
 
 
+class ConstraintForm(NamedTuple):
+    """An energy density as a sum of squares, Ψ = Σ k/2 C² + constant, which XPBD needs (Eq. 21); up to rotations of the
+    rest state.
+
+    ``functions`` are compiled, ``(F, *parameters) -> C, ∂C/∂F`` with the parameters of ``energy``; ``stiffness`` holds
+    each k [Pa], one over compliance and volume. PBD, which takes every k for infinite, needs ``met_at_rest``: C(I) = 0.
+    """
+
+    functions: tuple[Callable[..., Any], ...]
+    stiffness: tuple[float, ...]
+    met_at_rest: bool = True
+
+
 @dataclass(frozen=True, kw_only=True)
 class Material:
     """Base of every solid material.
@@ -35,7 +48,10 @@ class Material:
         energy(F, *parameters) -> Ψ [J/m³], zero at rest
         stress(F, *parameters) -> P = ∂Ψ/∂F [Pa], a tuple of three columns
 
-    and the methods ``parameters`` and ``block``. Decorate it with :func:`material`.
+    and the methods ``parameters`` and ``block``. Decorate it with :func:`material`. A third function is optional and
+    only for Newton's method, which otherwise takes differences of the stress::
+
+        hessian(F, D, *parameters) -> δP = ∂P/∂F : D [Pa], the change of the stress along D = δF
 
     Args:
         E: Young's modulus [Pa].
@@ -85,22 +101,38 @@ class Material:
         """The block a = 2μ, b = λ that the paper uses for every model, Eq. (32)."""
         return Block(2 * self.mu, max(self.lam, 0.0))
 
+    def constraints(self) -> ConstraintForm | None:
+        """The model as constraints, for XPBD and PBD; None if it has no such form."""
+        return None
+
 
 class Model(NamedTuple):
-    """The compiled functions of a material class, as the kernels see them."""
+    """The compiled functions of a material class, as the kernels see them; ``hessian`` only if the class has one."""
 
     name: str
     energy: Callable[..., Any]
     stress: Callable[..., Any]
     n_parameters: int
     isotropic: bool
+    hessian: Callable[..., Any] | None = None
 
 
 @cache
 def model_of(cls: Any, n_parameters: int) -> Model:
     """The model of a material class; compiled when a kernel first needs it."""
     energy, stress = _compiled(cls, "energy"), _compiled(cls, "stress")
-    return Model(cls.__name__, energy, stress, n_parameters, cls.isotropic)
+    hessian = _compiled(cls, "hessian") if has_hessian(cls) else None
+    return Model(cls.__name__, energy, stress, n_parameters, cls.isotropic, hessian)
+
+
+def has_hessian(cls: type) -> bool:
+    """Whether a material class has a Hessian of its stress: not one of a base whose stress it has replaced."""
+    for base in cls.__mro__:
+        if vars(base).get("hessian") is not None:
+            return True
+        if "stress" in vars(base):
+            return False
+    return False
 
 
 def _compiled(cls: type[Material], name: str) -> Callable[..., Any]:
@@ -117,13 +149,13 @@ M = TypeVar("M", bound=type)
 def material(cls: M) -> M:
     """Class decorator that makes a material of one's own; see :class:`Material` and ``docs/materials.md``.
 
-    The class becomes a frozen dataclass with E, nu and density besides its own fields, and ``energy`` and ``stress``
-    become functions that compiled code can call. Check it with :func:`pbng.check_material`.
+    The class becomes a frozen dataclass with E, nu and density besides its own fields, and ``energy``, ``stress`` and
+    ``hessian`` become functions that compiled code can call. Check it with :func:`pbng.check_material`.
     """
     if not issubclass(cls, Material):
         body = {k: v for k, v in vars(cls).items() if k not in ("__dict__", "__weakref__")}
         cls = type(cls.__name__, (Material,), body)  # type: ignore[assignment]
-    for name in ("energy", "stress"):
+    for name in ("energy", "stress", "hessian"):
         own = vars(cls).get(name)
         if own is not None:
             plain = own.__func__ if isinstance(own, staticmethod) else own

@@ -11,7 +11,8 @@ from numba.core.errors import NumbaError
 from pbng.dispatch import call, specialised
 from pbng.errors import InputError
 from pbng.jit import FLAGS, inline
-from pbng.materials.base import Material, Model, model_of
+from pbng.materials.base import Material, Model, has_hessian, model_of
+from pbng.materials.differentials import differential
 
 N_STATE = 500  # deformation gradients of each sort
 N_NODE = 2000  # configurations of one node
@@ -81,7 +82,8 @@ def check_material(material: Material) -> Report:
     ``finite``: values of Ψ and P that are NaN or infinite, inverted and collapsed states included. ``rest energy``,
     ``rest stress``: zero at F = I. ``stress, ...``: P against differences of Ψ. ``objectivity``: Ψ(QF) = Ψ(F) for
     rotations Q. ``isotropy``: Ψ(FQ) = Ψ(F), claimed by ``isotropic``. ``rest Hessian``: that of linear elasticity with
-    the material's μ and λ, Frobenius norm. ``float32``: the stress in float32 against float64, relative to what a
+    the material's μ and λ, Frobenius norm. ``Hessian, ...``: ``hessian`` against differences of P, where the material
+    has one of its own. ``float32``: the stress in float32 against float64, relative to what a
     relative change of F by one would make of it. ``block``: number of 2,000 configurations of one node in which the
     energy somewhere exceeds its majoriser E + Pg·u + ½ uᵀAu (method.md), for random displacements u and along the
     Newton step; if it is not 0 updates may raise the energy, and the note says from which largest stretch on.
@@ -118,6 +120,7 @@ class _Check:
             self._invariance("objectivity", every, left=True),
             self._invariance("isotropy", every, left=False),
             self._rest_hessian(),
+            *(self._hessian(name, F) for name, F in self.states.items() if has_hessian(type(self.material))),
             self._float32(np.concatenate([self.states["regular"], self.states["near-singular"]])),
             self._block(),
         ]
@@ -203,6 +206,21 @@ class _Check:
         want = mu * (D + D.transpose(0, 2, 1)) + lam * np.einsum("nii->n", D)[:, None, None] * one
         return Axiom("rest Hessian", float(np.linalg.norm(got - want) / np.linalg.norm(want)), 1e-7)
 
+    def _hessian(self, name: str, F: np.ndarray) -> Axiom:
+        """∂P/∂F : D, for all D, against differences of fourth order."""
+        cls: Any = type(self.material)
+        model = model_of(cls, len(self.material.parameters()))
+        try:
+            got = derivatives(model, F, self.material.parameters())
+        except NumbaError as error:
+            raise InputError(f"{model.name}: hessian does not compile:\n{error}") from error
+        size = np.linalg.norm(got, axis=(1, 2)) + self.scale
+        worst = np.zeros(len(F))
+        for k, D in enumerate(np.eye(9).reshape(9, 3, 3)):
+            want = _difference(self.stress, F, D, 5e-4).reshape(-1, 9)
+            worst = np.maximum(worst, np.abs(got[:, :, k] - want).max(1) / size)
+        return Axiom(f"Hessian, {name}", float(worst.max()), 1e-6)
+
     def _float32(self, F: np.ndarray) -> Axiom:
         F = F.astype(np.float32).astype(np.float64)
         exact, rounded = self.stress(F), self._evaluate(F, np.float32)[1]
@@ -255,6 +273,35 @@ def _difference(value: Any, F: np.ndarray, D: np.ndarray, h: float) -> np.ndarra
 def _cofactor(F: np.ndarray) -> np.ndarray:
     a, b, c = F[:, :, 0], F[:, :, 1], F[:, :, 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+
+
+def derivatives(model: Model, F: np.ndarray, numbers: tuple[float, ...]) -> np.ndarray:
+    """∂P/∂F [Pa] (n, 9, 9) of a model at F (n, 3, 3), rows and columns in order of F_ik: its own, or by differences."""
+    out = np.empty((len(F), 9, 9))
+    kernel = specialised(make_derivatives, (differential(model),))
+    kernel(np.ascontiguousarray(F, float), np.eye(9), tuple(float(p) for p in numbers), out)
+    return out
+
+
+def make_derivatives(key: str) -> Any:
+    """Kernel that fills ∂P/∂F (n, 9, 9) at F (n, 3, 3)."""
+
+    @njit(cache=True, **FLAGS)
+    def evaluate(F, unit, numbers, out):
+        for n in range(len(F)):
+            f = (
+                (F[n, 0, 0], F[n, 1, 0], F[n, 2, 0]),
+                (F[n, 0, 1], F[n, 1, 1], F[n, 2, 1]),
+                (F[n, 0, 2], F[n, 1, 2], F[n, 2, 2]),
+            )
+            for d in range(9):
+                e = unit[d]
+                P = call(key, 0, (f, ((e[0], e[3], e[6]), (e[1], e[4], e[7]), (e[2], e[5], e[8])), *numbers))
+                for i in range(3):
+                    for k in range(3):
+                        out[n, 3 * i + k, d] = P[k][i]
+
+    return evaluate
 
 
 @cache

@@ -24,6 +24,9 @@ class LinearElastic(Material):
         eps = mat_sub(mat_scale(real(0.5), mat_add(F, transpose(F))), one)
         return mat_combine(real(2) * mu, eps, lam * trace(eps), one)
 
+    def hessian(F, D, mu, lam):
+        return mat_combine(mu, mat_add(D, transpose(D)), lam * trace(D), identity(mu))
+
     def block(self) -> Block:
         """a = μ, b = λ + μ with the rest state's cofactor: the exact, constant Hessian of one node."""
         return Block(self.mu, max(self.lam + self.mu, 0.0), at_rest=True)

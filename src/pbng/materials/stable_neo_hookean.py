@@ -2,8 +2,9 @@
 
 import math
 
-from pbng.linalg import cofactor, det, mat_combine, norm2
+from pbng.linalg import cofactor, det, mat_add, mat_combine, norm2
 from pbng.materials.base import Block, Material, material
+from pbng.materials.differentials import cofactor_differential, mat_dot
 
 
 @material
@@ -27,6 +28,15 @@ class StableNeoHookean(Material):
         real = type(mu_s)
         a = mu_s - mu_s / (real(1) + norm2(F))
         return mat_combine(a, F, lam_s * (det(F) - real(1)) - real(0.75) * mu_s, cofactor(F))
+
+    def hessian(F, D, mu_s, lam_s):
+        real = type(mu_s)
+        H = cofactor(F)
+        share = real(1) / (real(1) + norm2(F))
+        pressure = lam_s * (det(F) - real(1)) - real(0.75) * mu_s
+        volume = mat_combine(lam_s * mat_dot(H, D), H, pressure, cofactor_differential(F, D))
+        growth = real(2) * mu_s * share * share * mat_dot(F, D)
+        return mat_add(mat_combine(mu_s - mu_s * share, D, growth, F), volume)
 
     def parameters(self) -> tuple[float, ...]:
         return 4 / 3 * self.mu, self.lam + 5 / 6 * self.mu

@@ -52,7 +52,7 @@ class VertexMethod:
         return self.x.copy()
 
     def certify(self) -> Certificate:
-        with self.threads.used():
+        with self.threads.used(), np.errstate(all="ignore"):  # what overflows is not finite, and seen
             f, force_scale, inverted = self.total_forces(self.x)
             energy = self.problem.energy(self.x, self.targets)
             return Certificate(float(np.linalg.norm(f[self.free])), energy, force_scale, inverted)
@@ -67,8 +67,11 @@ class VertexMethod:
 
     def floor(self, dtype: Any = None) -> float:
         """Norm of the forces that moving each vertex by half a unit in the last place of the largest position makes."""
-        rounding = 0.5 * float(np.finfo(dtype or float).eps) * float(np.abs(self.x).max(initial=0.0))
-        return rounding * float(np.linalg.norm(self._stiffness))
+        return self.rounding(dtype) * float(np.linalg.norm(self._stiffness))
+
+    def rounding(self, dtype: Any = None) -> float:
+        """Half a unit in the last place of the largest position [m], in a precision, by default float64."""
+        return 0.5 * float(np.finfo(dtype or float).eps) * float(np.abs(self.x).max(initial=0.0))
 
     @cached_property
     def _stiffness(self) -> np.ndarray:
