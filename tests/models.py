@@ -119,3 +119,21 @@ def oracle_stress(m, F):
         C = F.transpose(0, 2, 1) @ F
         return 2 * c * F + 2 * q / np.linalg.norm(C, axis=(1, 2))[:, None, None] * F @ C + (k * (J - 1) - p) * cof(F)
     raise TypeError(f"no oracle for {m!r}")
+
+
+@pbng.material
+class StVK(pbng.Material):
+    """Saint Venant-Kirchhoff: Ψ = μ |G|² + λ/2 (tr G)² with G = (FᵀF - I)/2, quartic in F; with the paper's block."""
+
+    def energy(F, mu, lam):
+        real = type(mu)
+        C = pbng.linalg.mat_mul(pbng.linalg.transpose(F), F)
+        G = pbng.linalg.mat_scale(real(0.5), pbng.linalg.mat_sub(C, pbng.linalg.identity(mu)))
+        tr = pbng.linalg.trace(G)
+        return mu * pbng.linalg.norm2(G) + real(0.5) * lam * tr * tr
+
+    def stress(F, mu, lam):
+        real = type(mu)
+        one = pbng.linalg.identity(mu)
+        G = pbng.linalg.mat_scale(real(0.5), pbng.linalg.mat_sub(pbng.linalg.mat_mul(pbng.linalg.transpose(F), F), one))
+        return pbng.linalg.mat_mul(F, pbng.linalg.mat_combine(real(2) * mu, G, lam * pbng.linalg.trace(G), one))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from conftest import STARTS, hard_start, held_box, mixed_problem, twisted_bar
-from models import SoftVolume
+from models import SoftVolume, StVK
 
 import pbng
 from pbng.solvers.loop import run
@@ -233,3 +233,13 @@ def test_default_solver():
 def test_bad_options_are_named(make, word):
     with pytest.raises(pbng.InputError, match=word):
         make()
+
+
+@pytest.mark.parametrize("solver", [pbng.PBNG(), pbng.PBNG(dtype="float64"), pbng.MultigridPBNG()])
+@pytest.mark.parametrize("start", ["rest", *STARTS])
+def test_blocks_that_do_not_bound_the_energy(solver, start):
+    """Of a quartic energy no two numbers do: sweeps raise it, and are then relaxed until they do not."""
+    problem = twisted_bar(StVK(E=1e5, nu=0.3)).compile()
+    x = problem.X if start == "rest" else hard_start(problem, start)
+    result = pbng.solve(problem, solver, pbng.Budget(rtol=1e-4, iterations=1500), start=x)
+    assert result.status is pbng.Status.CONVERGED

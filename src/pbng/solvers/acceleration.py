@@ -22,12 +22,16 @@ class FixedPoint(Protocol):
     """What is accelerated; arrays are flat positions, of which the first ``n_free`` entries are free."""
 
     n_free: int
+    known_energy: float  # of the state at the start [J], infinite if nobody has asked
 
     def apply(self, x: np.ndarray, omega: float = 1.0) -> None:
         """x <- G(x), each node's step relaxed by omega."""
 
     def energy(self, x: np.ndarray) -> float:
         """Potential energy [J] in float64."""
+
+    def rises(self, energy: float, before: float, x: np.ndarray) -> bool:
+        """Whether an energy, at x, is above an earlier one by more than rounding may explain."""
 
 
 class Iteration(Protocol):
@@ -165,7 +169,8 @@ class _Mixing:
     def step(self, x: np.ndarray) -> None:
         n = self.map.n_free
         if not self.buffers:
-            self.buffers = np.empty_like(x), x.copy(), np.empty_like(x)  # G(x), mixed, last checked
+            self.energy = self.map.known_energy
+            self.buffers = np.empty_like(x), x.copy(), x.copy()  # G(x), mixed, last checked
         g, mixed, checked = self.buffers
         g[:] = x
         self.map.apply(g, self.omega)
@@ -182,8 +187,14 @@ class _Mixing:
                 g[:] = checked
                 self.map.apply(g, self.omega)
             self._restart()
+        energy = self.map.energy(g)
+        if self.map.rises(energy, self.energy, g):
+            self.omega *= 0.5  # the energy of some material is not bounded by its block: tread softly
+            self._restart()
+            x[:] = checked
+            return
         x[:] = checked[:] = g
-        self.energy, self.unchecked = self.map.energy(g), 0
+        self.energy, self.unchecked = energy, 0
 
     def settle(self, x: np.ndarray) -> None:
         if self.unchecked and not self._passes(x):

@@ -94,9 +94,8 @@ class TwoGrid(PackedMethod):
         stiff = any(g.material.lam > 10 * g.material.mu for g in problem.groups)
         self.times = solver.sweeps or (8 if stiff else 4)
         self.d = np.zeros(self.n_free)
-        stiffness = self.packed.stiffness + self.packed.weak_stiffness
+        stiffness = self.stiffness
         self.compliance = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
-        self.total_stiffness = float(stiffness.sum())
 
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
         fixed = self.problem.fixed
@@ -116,6 +115,7 @@ class TwoGrid(PackedMethod):
         self.g, self.z = self.x.copy(), self.x.copy()
         self.history = MixingHistory(self.cycle.memory) if self.cycle.memory else None
         self.E = self.energy(self.x)
+        self.omega = self.cycle.omega
         self.refreshed = False
         self.moved: list[float] = []  # largest movement of a vertex in each of the last three cycles [m]
 
@@ -133,15 +133,15 @@ class TwoGrid(PackedMethod):
         """z and its energy Ez from x."""
         n, g, z = self.n_free, self.g, self.z
         g[:] = self.x
-        self.apply(g, self.cycle.omega)
+        self.apply(g, self.omega)
         f, _, _ = self.free_forces(g)
-        if not np.isfinite(f).all():  # the loop will say so
-            z[:], self.Ez = g, math.nan
+        if not np.isfinite(f).all():
+            self._tread_softly()
             return
         self.coarse.refresh(g)
         self.refreshed = True
         slope = self.coarse.direction(f, self.d, COARSE_TOLERANCE)
-        tolerance = self._noise(g)
+        tolerance = self.noise(g, self.E)
         np.add(g[:n], self.d, out=z[:n], casting="same_kind")
         self.Ez = self.energy(z)
         if self.Ez <= self.E - DECREASE * slope + tolerance:
@@ -149,28 +149,32 @@ class TwoGrid(PackedMethod):
         Eg, alpha = self.energy(g), 1.0
         for _ in range(BACKTRACKS):
             # A large rotation, taken along a line, stretches every element; a few sweeps undo that.
-            self.apply(z, self.cycle.omega)
+            self.apply(z, self.omega)
             self.Ez = self.energy(z)
             if self.Ez <= Eg - DECREASE * alpha * slope + tolerance:
                 return
             alpha *= SHRINK
             np.add(g[:n], alpha * self.d, out=z[:n], casting="same_kind")
-        z[:], self.Ez = g, Eg
+        if self.rises(Eg, self.E, g):
+            self._tread_softly()
+        else:
+            z[:], self.Ez = g, Eg
+
+    def _tread_softly(self) -> None:
+        """After sweeps that have raised the energy, as they may where a material's block does not bound it."""
+        self.omega *= SHRINK
+        self.z[:], self.Ez = self.x, self.E
 
     def _mix(self) -> None:
         """The next x from the last one and z."""
         n, m, history = self.n_free, self.g, self.history
         if history is not None and history.push(self.x[:n], self.z[:n]) and history.mix(self.z[:n], m[:n]):
             energy = self.energy(m)
-            if energy <= self.Ez + self._noise(m):
+            if energy <= self.Ez + self.noise(m, self.E):
                 self.x, self.g, self.E = m, self.x, energy
                 return
             history.restart()
         self.x, self.z, self.E = self.z, self.x, self.Ez
-
-    def _noise(self, x: np.ndarray) -> float:
-        """What rounding may do to an energy [J]."""
-        return self.total_stiffness * self.rounding(x) ** 2 + 1e-13 * abs(self.E)
 
     def certify(self) -> Certificate:
         with self.threads.used():

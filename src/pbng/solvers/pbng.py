@@ -1,5 +1,6 @@
 """Position-based nonlinear Gauss-Seidel (section 7): coloured sweeps, accelerated."""
 
+import math
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,9 @@ from pbng.solvers.acceleration import Acceleration, Anderson, Iteration, NodeSOR
 from pbng.solvers.base import Certificate
 from pbng.solvers.threads import FIRST_PROBE, Threads, check_threads
 from pbng.sweep import sweep
+
+
+DOUBT = 16.0  # how many roundings of every element's corners an energy may be off by
 
 
 @dataclass(frozen=True)
@@ -92,11 +96,15 @@ class PackedMethod:
         forward = np.arange(self.packed.n_color)
         self.colors = np.concatenate([forward, forward[::-1]]) if solver.symmetric else forward
         self.n_free = self.packed.n_free
+        self.stiffness = self.packed.stiffness + self.packed.weak_stiffness
+        self.total_stiffness = float(self.stiffness.sum())
         self.weak = WeakEnergy(problem.weak, self.packed.n_slot, self.packed.slot) if problem.weak else None
         self.f_ext = np.zeros(4 * self.packed.n_slot)
         self.f_ext.reshape(-1, 4)[self.packed.slot, :3] = problem.f_ext
         self.loaded = bool(self.f_ext.any())
         self.forces = np.empty(4 * self.packed.n_slot)
+        self.load = float(np.linalg.norm(problem.f_ext, axis=1).sum())
+        self.force_scale = 0.0  # when forces were last evaluated [N]
         self.targets = np.zeros((problem.n_target, 3))
         self.x = self.packed.pack(problem.X, self.targets)
         self.iteration: Iteration | None = None
@@ -107,13 +115,15 @@ class PackedMethod:
 
     def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
         self.targets = self.problem.targets(self.problem.end) if targets is None else targets
+        self.prescribed = np.array(x[self.problem.fixed], float)
         self.packed = self.layout("float32" if self.solver.dtype == "auto" else self.solver.dtype)
         self.begin(x)
 
     def refine(self) -> bool:
         if self.solver.dtype != "auto" or self.packed.dtype == np.float64:
             return False
-        x = self.state()
+        x = np.asarray(self.state(), float)
+        x[self.problem.fixed] = self.prescribed  # they too were rounded
         with self.threads.used():
             self.packed = self.layout("float64")
         self.begin(x)
@@ -128,6 +138,7 @@ class PackedMethod:
     def begin(self, x: np.ndarray) -> None:
         """Take x (n_vert, 3) as the state, in the present precision, with no history."""
         self.x = self.packed.pack(x, self.targets)
+        self.known_energy = math.inf
         acceleration: Acceleration = self.solver.acceleration
         self.iteration = acceleration.start(self)
 
@@ -154,7 +165,8 @@ class PackedMethod:
     def certify(self) -> Certificate:
         with self.threads.used():
             f, force_scale, inverted = self.free_forces(self.x)
-            return Certificate(float(np.linalg.norm(f)), self.energy(self.x), force_scale, inverted)
+            self.known_energy = self.energy(self.x)
+            return Certificate(float(np.linalg.norm(f)), self.known_energy, force_scale, inverted)
 
     def free_forces(self, x: np.ndarray) -> tuple[np.ndarray, float, int]:
         """Total forces on the free vertices [N], flat, with the force scale [N] and the number of inverted elements."""
@@ -163,11 +175,24 @@ class PackedMethod:
             weak, scale = self.weak.forces(self._places(x), self.targets - self.packed.origin)
             self.forces.reshape(-1, 4)[:, :3] += weak
             force_scale += scale
+        self.force_scale = force_scale
         return self.forces[: self.n_free] + self.f_ext[: self.n_free], force_scale, inverted
 
     def floor(self, dtype: Any = None) -> float:
         """Norm of the forces that moving each node by half a unit in the last place of the largest position makes."""
-        return self.rounding(self.x, dtype) * float(np.linalg.norm(self.packed.stiffness + self.packed.weak_stiffness))
+        return self.rounding(self.x, dtype) * float(np.linalg.norm(self.stiffness))
+
+    def noise(self, x: np.ndarray, energy: float) -> float:
+        """What rounding may do to an energy [J] at x."""
+        return self.total_stiffness * self.rounding(x) ** 2 + 1e-13 * abs(energy)
+
+    def rises(self, energy: float, before: float, x: np.ndarray) -> bool:
+        """Whether an energy, at x, is above an earlier one by more than rounding may explain; also if it is not finite.
+
+        Energies sum what elements store, so that moving their corners by a rounding counts even where forces balance.
+        """
+        doubt = DOUBT * (self.force_scale + self.load) * self.rounding(x)
+        return not energy <= before + self.noise(x, before) + doubt
 
     def rounding(self, x: np.ndarray, dtype: Any = None) -> float:
         """Half a unit in the last place of the largest position [m], in a precision, by default that of x."""
