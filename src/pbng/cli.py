@@ -59,8 +59,8 @@ def run(
     solver: Annotated[
         str | None,
         typer.Option(
-            help="auto, multigrid, anderson, plain, node-sor, sor, chebyshev, newton, xpbd, pbd; parameters after a colon:"
-            " anderson:5."
+            help="auto, multigrid, anderson, plain, node-sor, sor, chebyshev, newton, xpbd, pbd;"
+            " parameters after a colon: anderson:5."
         ),
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="At most so many iterations a frame.")] = None,

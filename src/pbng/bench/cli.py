@@ -118,11 +118,11 @@ def accuracy_command(
     """Residual and true position error against seconds, by method: the block of ``convergence``."""
     from pbng.bench import accuracy
 
-    curves = accuracy.measure(n, model, nu, seconds, threads)
+    found = accuracy.measure(n, model, nu, seconds, threads)
     about = f"{n}³ vertices, {model}, ν = {nu}"
     if out is not None:
-        accuracy.draw(curves, out / f"accuracy_{n}_{model}_{nu}.png", about)
-    rows = [{"n": n, "model": model, "nu": nu, "method": name} | accuracy.row(c) for name, c in curves.items()]
+        accuracy.draw(found, out / f"accuracy_{n}_{model}_{nu}.png", about)
+    rows = [{"n": n, "model": model, "nu": nu} | row for row in accuracy.rows(found)]
     ratios = [Column(f"{level:.0e}", f"ratio {level:.0e}", "{:.3f}") for level in accuracy.RATIOS]
     errors = [Column(f"error {level:.0e}", f"error {level:.0e}", "{:.3f}") for level in accuracy.ERRORS]
     show(

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from pbng.compare.frames import contest_frames
+from pbng.compare.start import distance
 from pbng.drivers import simulate
 from pbng.gallery import find
 from pbng.solvers.base import Budget, Solver
@@ -32,22 +34,12 @@ def measure(n: int, frames: int = 30, threads: int | None = None) -> list[Row]:
         problem, MultigridPBNG(threads=threads), Budget(rtol=1e-9, iterations=60), frames=frames, fps=recipe.fps
     )
     truth = [frame.x for frame in exact]
+    # The residual is looked at once a frame, and not counted.
+    entries = {name: (solver, Budget(iterations=count)) for name, (solver, count) in contestants(threads).items()}
+    curves = contest_frames(problem, entries, frames=frames, fps=recipe.fps, keep=range(frames))
     rows = []
-    for name, (solver, iterations) in contestants(threads).items():
-        # The residual is looked at once a frame, and not counted.
-        budget = Budget(iterations=iterations, every=1000)
-        list(simulate(problem, solver, budget, frames=4, fps=recipe.fps))  # kernels are loaded
-        errors, milliseconds = [], []
-        for frame, x in zip(simulate(problem, solver, budget, frames=frames, fps=recipe.fps), truth):
-            errors.append(float(np.linalg.norm(frame.x - x, axis=1).max()) / size)
-            milliseconds.append((frame.result.seconds - frame.result.monitor_seconds) * 1e3)
-        rows.append(
-            {
-                "budget": name,
-                "ms": float(np.median(milliseconds[1:])),
-                "median": float(np.median(errors[1:])),
-                "last": errors[-1],
-                "errors": errors,
-            }
-        )
+    for name, curve in curves.items():
+        errors = [distance(curve.positions[k], x) / size for k, x in enumerate(truth)]
+        median = float(np.median(errors[1:]))
+        rows.append({"budget": name, "ms": curve.ms, "median": median, "last": errors[-1], "errors": errors})
     return rows

@@ -1,6 +1,5 @@
 """Timing on a noisy machine: contestants take turns, round after round, and the median and the best are kept."""
 
-import os
 import platform
 import resource
 import time
@@ -8,6 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+
+from pbng.compare.machine import machine as machine
 
 
 def interleaved(contestants: dict[str, Callable[[], Any]], rounds: int, calls: int = 1) -> dict[str, np.ndarray]:
@@ -28,22 +29,3 @@ def peak_memory() -> float:
     """Largest memory this process has used [bytes]."""
     scale = 1 if platform.system() == "Darwin" else 1024
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * scale)
-
-
-def machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
-    import numba
-
-    model = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo") as info:
-            model = next(line.split(":")[1].strip() for line in info if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
-    return {
-        "cpu": model,
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "numba": numba.__version__,
-    }

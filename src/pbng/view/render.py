@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -92,6 +92,7 @@ def sheet(
     path: str | os.PathLike[str],
     frames: int = 6,
     *,
+    captions: Sequence[str] | None = None,
     color: str = "stretch",
     width: int = 1800,
     edges: bool | None = None,
@@ -100,9 +101,12 @@ def sheet(
 ) -> Path:
     """Draw several frames, evenly spaced in time, side by side in one picture; returns its path.
 
-    The arguments are those of :func:`picture`; ``width`` [pixels] is that of the whole, its height follows.
+    The arguments are those of :func:`picture`; ``captions``, one for each frame of the source, stand in place of the
+    times; ``width`` [pixels] is that of the whole, its height follows.
     """
     motion = Motion.of(source)
+    if captions is not None and len(captions) != len(motion):
+        raise InputError(f"there are {len(captions)} captions for {len(motion)} frames")
     chosen = np.unique(np.linspace(0, len(motion) - 1, max(1, min(frames, len(motion)))).round().astype(int))
     path = _ready(path)
     artist = _Artist(motion, color, edges, azimuth, elevation)
@@ -114,7 +118,8 @@ def sheet(
         for i, k in enumerate(chosen):
             frame = motion.frames[k]
             row, column = i // columns * tile[1], i % columns * tile[0]
-            image = over(_faded(artist.draw(stage, frame, bar=False)), caption(tile, f"t = {frame.t:.2f} s", unit))
+            words = f"t = {frame.t:.2f} s" if captions is None else captions[k]
+            image = over(_faded(artist.draw(stage, frame, bar=False)), caption(tile, words, unit))
             page[row : row + tile[1], column : column + tile[0]] = image
     return _save(artist.with_bar(page, unit), path)
 
