@@ -125,3 +125,16 @@ def test_unknown_scene_names_its_neighbours():
         find("twistingblock")
     with pytest.raises(pbng.InputError, match="hanging_bar"):
         find("zzz")
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_newton_and_pbng_agree(name):
+    """The same equilibrium to 1e-6 of the size; where a motion goes far in one step there may be several."""
+    problem = SCENES[name](resolution=TINY.get(name, 5)).scene.compile()
+    size = np.ptp(problem.X, axis=0).max()
+    budget = pbng.Budget(atol=1e-7 * np.linalg.norm(problem.f_ext) + 1e-9, iterations=300)
+    solvers = pbng.Newton(), pbng.MultigridPBNG()
+    newton, ours = (pbng.solve(problem, solver, budget, at=0.3 * problem.end) for solver in solvers)
+    assert newton.status is pbng.Status.CONVERGED
+    assert ours.status is pbng.Status.CONVERGED
+    assert np.abs(newton.x - ours.x).max() < 1e-6 * size
