@@ -7,7 +7,7 @@ from .errors import InputError as InputError
 from .io.export import export as export
 from .io.frames import FrameWriter as FrameWriter, read_run as read_run
 from .io.meshes import read_mesh as read_mesh, read_surface as read_surface
-from .materials.base import Block as Block, Material as Material, material as material
+from .materials.base import Block as Block, ConstraintForm as ConstraintForm, Material as Material, material as material
 from .materials.check import check_material as check_material
 from .materials.corotated import Corotated as Corotated
 from .materials.invariants import InvariantMaterial as InvariantMaterial
