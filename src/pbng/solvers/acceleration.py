@@ -23,6 +23,7 @@ class FixedPoint(Protocol):
 
     n_free: int
     known_energy: float  # of the state at the start [J], infinite if nobody has asked
+    trust: int  # checks that an acceleration has passed in a row, in this solve and those before
 
     def apply(self, x: np.ndarray, omega: float = 1.0) -> None:
         """x <- G(x), each node's step relaxed by omega."""
@@ -162,7 +163,6 @@ class _Mixing:
         self.map, self.omega = map, omega
         self.energy = math.inf  # at the last checked state
         self.unchecked = 0  # steps since
-        self.good = 0  # checks passed in a row
         self.history = MixingHistory(memory)
         self.buffers: tuple[np.ndarray, ...] = ()
 
@@ -176,7 +176,7 @@ class _Mixing:
         self.map.apply(g, self.omega)
         if self.history.push(x[:n], g[:n]):
             if self.history.mix(g[:n], mixed[:n]):
-                if self.good >= self.PROBATION and self.unchecked + 1 < self.EVERY:
+                if self._trusted():
                     x[:] = mixed
                     self.unchecked += 1
                     return
@@ -187,6 +187,10 @@ class _Mixing:
                 g[:] = checked
                 self.map.apply(g, self.omega)
             self._restart()
+        elif self._trusted() and math.isfinite(self.energy):
+            x[:] = g
+            self.unchecked += 1
+            return
         energy = self.map.energy(g)
         if self.map.rises(energy, self.energy, g):
             self.omega *= 0.5  # the energy of some material is not bounded by its block: tread softly
@@ -207,12 +211,17 @@ class _Mixing:
         if not energy <= self.energy:
             return False
         self.buffers[2][:] = x
-        self.energy, self.unchecked, self.good = energy, 0, self.good + 1
+        self.energy, self.unchecked = energy, 0
+        self.map.trust += 1
         return True
+
+    def _trusted(self) -> bool:
+        """Whether the next step need not be checked."""
+        return self.map.trust >= self.PROBATION and self.unchecked + 1 < self.EVERY
 
     def _restart(self) -> None:
         self.history.restart()
-        self.good, self.unchecked = 0, 0
+        self.map.trust, self.unchecked = 0, 0
 
 
 class MixingHistory:

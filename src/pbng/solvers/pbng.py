@@ -108,6 +108,7 @@ class PackedMethod:
         self.targets = np.zeros((problem.n_target, 3))
         self.x = self.packed.pack(problem.X, self.targets)
         self.iteration: Iteration | None = None
+        self.known_energy, self.trust = math.inf, 0
         self.setup_seconds = time.perf_counter() - compile_seconds() - start
 
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
