@@ -18,7 +18,6 @@ from pbng.solvers.base import Certificate
 from pbng.solvers.threads import FIRST_PROBE, Threads, check_threads
 from pbng.sweep import sweep
 
-
 DOUBT = 16.0  # how many roundings of every element's corners an energy may be off by
 
 
