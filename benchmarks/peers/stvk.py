@@ -8,8 +8,8 @@ from pbng.linalg import identity, mat_combine, mat_mul, mat_scale, norm2, trace,
 class StVK(pbng.Material):
     """Ψ = μ |G|² + λ/2 (tr G)² with Green's strain G = (FᵀF - I) / 2; quartic in F, weak in compression.
 
-    Its curvature grows without bound, so no two numbers majorise it: its block is the paper's, right near rest, and pbng
-    relaxes sweeps that raise the energy.
+    Its curvature grows without bound, so no two numbers majorise it. Its block is the paper's, right near rest;
+    pbng relaxes sweeps that raise the energy.
     """
 
     def energy(F, mu, lam):

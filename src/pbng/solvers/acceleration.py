@@ -32,7 +32,7 @@ class FixedPoint(Protocol):
         """Potential energy [J] in float64."""
 
     def rises(self, energy: float, before: float, x: np.ndarray) -> bool:
-        """Whether an energy, at x, is above an earlier one by more than rounding may explain."""
+        """Whether an energy is above an earlier one, that of x, by more than rounding may explain."""
 
 
 class Iteration(Protocol):
@@ -160,7 +160,7 @@ class _Mixing:
     PROBATION, EVERY = 5, 5  # mixed steps in a row that must prove good one by one; then one in so many is checked
 
     def __init__(self, map: FixedPoint, memory: int, omega: float) -> None:
-        self.map, self.omega = map, omega
+        self.map, self.softness = map, Softness(omega)
         self.energy = math.inf  # at the last checked state
         self.unchecked = 0  # steps since
         self.history = MixingHistory(memory)
@@ -173,7 +173,7 @@ class _Mixing:
             self.buffers = np.empty_like(x), x.copy(), x.copy()  # G(x), mixed, last checked
         g, mixed, checked = self.buffers
         g[:] = x
-        self.map.apply(g, self.omega)
+        self.map.apply(g, self.softness.omega)
         if self.history.push(x[:n], g[:n]):
             if self.history.mix(g[:n], mixed[:n]):
                 if self._trusted():
@@ -185,15 +185,15 @@ class _Mixing:
                     return
             if self.unchecked:
                 g[:] = checked
-                self.map.apply(g, self.omega)
+                self.map.apply(g, self.softness.omega)
             self._restart()
         elif self._trusted() and math.isfinite(self.energy):
             x[:] = g
             self.unchecked += 1
             return
         energy = self.map.energy(g)
-        if self.map.rises(energy, self.energy, g):
-            self.omega *= 0.5  # the energy of some material is not bounded by its block: tread softly
+        if self.map.rises(energy, self.energy, checked):
+            self.softness.fail()
             self._restart()
             x[:] = checked
             return
@@ -213,6 +213,8 @@ class _Mixing:
         self.buffers[2][:] = x
         self.energy, self.unchecked = energy, 0
         self.map.trust += 1
+        if self.softness.succeed():
+            self.history.restart()  # it was that of another map
         return True
 
     def _trusted(self) -> bool:
@@ -222,6 +224,33 @@ class _Mixing:
     def _restart(self) -> None:
         self.history.restart()
         self.map.trust, self.unchecked = 0, 0
+
+
+class Softness:
+    """The relaxation of sweeps: less where they have raised the energy, as of materials whose block does not bound it.
+
+    To halve ω is as good as to double the block. It comes back step by step, ever later after each failure.
+    """
+
+    def __init__(self, omega: float) -> None:
+        self.omega = self.most = omega
+        self.wait, self.patience = 0, 4
+
+    def fail(self) -> None:
+        """Sweeps with ω have raised the energy."""
+        self.omega *= 0.5
+        self.patience = min(2 * self.patience, 256)
+        self.wait = self.patience
+
+    def succeed(self) -> bool:
+        """They have not; whether ω is now another."""
+        if self.omega == self.most:
+            return False
+        self.wait -= 1
+        if self.wait > 0:
+            return False
+        self.omega, self.wait = min(2 * self.omega, self.most), self.patience
+        return True
 
 
 class MixingHistory:

@@ -21,7 +21,7 @@ from pbng.coarse.space import CoarseSpace
 from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.problem import Problem
-from pbng.solvers.acceleration import MixingHistory
+from pbng.solvers.acceleration import MixingHistory, Softness
 from pbng.solvers.base import Certificate
 from pbng.solvers.pbng import PBNG, PackedMethod, checked_dtype
 from pbng.solvers.threads import check_threads
@@ -115,7 +115,7 @@ class TwoGrid(PackedMethod):
         self.g, self.z = self.x.copy(), self.x.copy()
         self.history = MixingHistory(self.cycle.memory) if self.cycle.memory else None
         self.E = self.energy(self.x)
-        self.omega = self.cycle.omega
+        self.softness = Softness(self.cycle.omega)
         self.refreshed = False
         self.moved: list[float] = []  # largest movement of a vertex in each of the last three cycles [m]
 
@@ -133,7 +133,7 @@ class TwoGrid(PackedMethod):
         """z and its energy Ez from x."""
         n, g, z = self.n_free, self.g, self.z
         g[:] = self.x
-        self.apply(g, self.omega)
+        self.apply(g, self.softness.omega)
         f, _, _ = self.free_forces(g)
         if not np.isfinite(f).all():
             self._tread_softly()
@@ -141,28 +141,29 @@ class TwoGrid(PackedMethod):
         self.coarse.refresh(g)
         self.refreshed = True
         slope = self.coarse.direction(f, self.d, COARSE_TOLERANCE)
-        tolerance = self.noise(g, self.E)
+        tolerance = self.noise(self.x, self.E)
         np.add(g[:n], self.d, out=z[:n], casting="same_kind")
         self.Ez = self.energy(z)
         if self.Ez <= self.E - DECREASE * slope + tolerance:
+            self.softness.succeed()
             return
         Eg, alpha = self.energy(g), 1.0
+        if self.rises(Eg, self.E, self.x):
+            self._tread_softly()
+            return
         for _ in range(BACKTRACKS):
             # A large rotation, taken along a line, stretches every element; a few sweeps undo that.
-            self.apply(z, self.omega)
+            self.apply(z, self.softness.omega)
             self.Ez = self.energy(z)
             if self.Ez <= Eg - DECREASE * alpha * slope + tolerance:
                 return
             alpha *= SHRINK
             np.add(g[:n], alpha * self.d, out=z[:n], casting="same_kind")
-        if self.rises(Eg, self.E, g):
-            self._tread_softly()
-        else:
-            z[:], self.Ez = g, Eg
+        z[:], self.Ez = g, Eg
 
     def _tread_softly(self) -> None:
         """After sweeps that have raised the energy, as they may where a material's block does not bound it."""
-        self.omega *= SHRINK
+        self.softness.fail()
         self.z[:], self.Ez = self.x, self.E
 
     def _mix(self) -> None:
@@ -170,7 +171,7 @@ class TwoGrid(PackedMethod):
         n, m, history = self.n_free, self.g, self.history
         if history is not None and history.push(self.x[:n], self.z[:n]) and history.mix(self.z[:n], m[:n]):
             energy = self.energy(m)
-            if energy <= self.Ez + self.noise(m, self.E):
+            if energy <= self.Ez + self.noise(self.x, self.E):
                 self.x, self.g, self.E = m, self.x, energy
                 return
             history.restart()
@@ -179,6 +180,7 @@ class TwoGrid(PackedMethod):
     def certify(self) -> Certificate:
         with self.threads.used():
             f, force_scale, inverted = self.free_forces(self.x)
+            self.force_scale = force_scale
             return Certificate(float(np.linalg.norm(f)), self.E, force_scale, inverted, self._error(f))
 
     def _error(self, f: np.ndarray) -> float:

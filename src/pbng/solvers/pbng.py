@@ -18,7 +18,7 @@ from pbng.solvers.base import Certificate
 from pbng.solvers.threads import FIRST_PROBE, Threads, check_threads
 from pbng.sweep import sweep
 
-DOUBT = 16.0  # how many roundings of every element's corners an energy may be off by
+DOUBT = 16.0  # how many roundings an energy may be off by
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class PackedMethod:
         self.loaded = bool(self.f_ext.any())
         self.forces = np.empty(4 * self.packed.n_slot)
         self.load = float(np.linalg.norm(problem.f_ext, axis=1).sum())
-        self.force_scale = 0.0  # when forces were last evaluated [N]
+        self.force_scale = 0.0  # of the last certificate [N]
         self.targets = np.zeros((problem.n_target, 3))
         self.x = self.packed.pack(problem.X, self.targets)
         self.iteration: Iteration | None = None
@@ -165,7 +165,7 @@ class PackedMethod:
     def certify(self) -> Certificate:
         with self.threads.used():
             f, force_scale, inverted = self.free_forces(self.x)
-            self.known_energy = self.energy(self.x)
+            self.known_energy, self.force_scale = self.energy(self.x), force_scale
             return Certificate(float(np.linalg.norm(f)), self.known_energy, force_scale, inverted)
 
     def free_forces(self, x: np.ndarray) -> tuple[np.ndarray, float, int]:
@@ -175,7 +175,6 @@ class PackedMethod:
             weak, scale = self.weak.forces(self._places(x), self.targets - self.packed.origin)
             self.forces.reshape(-1, 4)[:, :3] += weak
             force_scale += scale
-        self.force_scale = force_scale
         return self.forces[: self.n_free] + self.f_ext[: self.n_free], force_scale, inverted
 
     def floor(self, dtype: Any = None) -> float:
@@ -187,12 +186,15 @@ class PackedMethod:
         return self.total_stiffness * self.rounding(x) ** 2 + 1e-13 * abs(energy)
 
     def rises(self, energy: float, before: float, x: np.ndarray) -> bool:
-        """Whether an energy, at x, is above an earlier one by more than rounding may explain; also if it is not finite.
+        """Whether an energy is above an earlier one, that of x, by more than rounding may explain, or is not finite.
 
-        Energies sum what elements store, so that moving their corners by a rounding counts even where forces balance.
+        Energies sum what elements store, and near rest that is a difference of larger numbers: both count, even where
+        forces balance.
         """
-        doubt = DOUBT * (self.force_scale + self.load) * self.rounding(x)
-        return not energy <= before + self.noise(x, before) + doubt
+        largest = float(np.abs(x).max(initial=0.0))
+        stored = (self.force_scale + self.load) * self.rounding(x)
+        differences = self.total_stiffness * largest * self.rounding(x, np.float64)
+        return not energy <= before + self.noise(x, before) + DOUBT * (stored + differences)
 
     def rounding(self, x: np.ndarray, dtype: Any = None) -> float:
         """Half a unit in the last place of the largest position [m], in a precision, by default that of x."""
