@@ -149,3 +149,19 @@ def test_massless_bodies_are_refused():
 def test_free_bodies_need_inertia():
     with pytest.raises(pbng.InputError, match="no vertex is pinned"):
         pbng.simulate(free_box(), frames=2)
+
+
+@pytest.mark.parametrize("solver", [*SOLVERS, pbng.Newton()])
+def test_bodies_bound_by_stiff_springs_move_together(solver):
+    """Compound nodes carry mass too: every method takes the same steps, and the springs stay shut."""
+    scene = pbng.Scene(gravity=(0, -9.8, 0))
+    box = pbng.shapes.box(size=(1, 1, 1), vertices=(4, 4, 4))
+    upper, lower = scene.add(box, RUBBER, at=(0, 1, 0)), scene.add(box, RUBBER, at=(0.1, 0, 0.1))
+    scene.pin(upper.where(y=2.0))
+    scene.bind(lower.where(y=1.0), upper, k=1e8)
+    budget = pbng.Budget(rtol=1e-9, atol=1e-6, iterations=300)
+    *_, last = pbng.simulate(scene, solver, budget, frames=4, fps=20, inertia=True)
+    assert last.result.status is pbng.Status.CONVERGED
+    assert np.linalg.norm(last.springs[:, 0] - last.springs[:, 1], axis=1).max() < 1e-4  # 0.1 at rest, at two edges
+    *_, judge = pbng.simulate(scene, pbng.Newton(), budget, frames=4, fps=20, inertia=True)
+    np.testing.assert_allclose(last.x, judge.x, atol=1e-6)
