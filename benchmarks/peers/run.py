@@ -110,9 +110,11 @@ def measure(title: str, command: list[str], n: int, material: str, threads: int,
     start, before, ended = time.perf_counter(), os.getloadavg()[0], False
     environment = os.environ | {name: str(threads) for name in THREADS}
     with tempfile.TemporaryFile("w+") as errors:
+        # In the folder of the problem, which is thrown away: MuJoCo leaves a log where it runs.
         process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment
-        )
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment,
+            cwd=Path(command[2]).parent,
+        )  # fmt: skip
 
         def end() -> None:
             nonlocal ended
