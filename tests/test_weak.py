@@ -216,3 +216,46 @@ def test_stiff_springs_without_a_gap_are_not_taken_for_rest(solver):
     result = pbng.solve(problem, solver, pbng.Budget(rtol=1e-5, iterations=300), start=problem.X)
     assert result.status is pbng.Status.CONVERGED
     assert result.iterations > 2
+
+
+def three_blocks(turned):
+    """A tied to B, and B to C, at the vertices of one edge."""
+    scene = pbng.Scene(gravity=(0, -9.8, 0))
+    flesh, box = pbng.Corotated(E=1e3, nu=0.3, density=10), pbng.shapes.box(size=(1, 1, 1), vertices=(4, 4, 4))
+    a, b, c = (scene.add(box, flesh, at=at) for at in ((0, 0, 0), (0, 1, 0), (1, 0, 0)))
+    scene.pin(b.where(y=2.0))
+    edge = {"x": 1.0, "y": 1.0}
+    ties = (a.where(**edge), b.where(**edge)), (b.where(**edge), c.where(**edge))
+    for first, second in ties:
+        scene.bind(*((second, first) if turned and first.body is b else (first, second)), k=1e8)
+    return scene.compile()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_chains_of_ties_move_as_one(turned):
+    result = pbng.solve(three_blocks(turned), pbng.PBNG(), pbng.Budget(rtol=1e-5, iterations=400))
+    assert result.status is pbng.Status.CONVERGED
+
+
+@pytest.mark.parametrize("k", [1e8, 1e-3])
+def test_springs_beside_springs(k):
+    """A second spring between the same vertices, stiff or weak, does not change who moves with whom."""
+    problem = two_blocks(1e8)
+    w = problem.weak[0]
+    twice = replace(problem, weak=(*problem.weak, replace(w, K=k / 1e8 * w.K)))
+    np.testing.assert_array_equal(Compounds(twice).beta.toarray(), Compounds(problem).beta.toarray())
+    result = pbng.solve(twice, pbng.PBNG(), pbng.Budget(rtol=1e-7, iterations=200))
+    assert result.status is pbng.Status.CONVERGED
+
+
+def test_precision_at_the_start_is_kept_when_a_movement_is_extended():
+    """Stiff springs make a solve begin in float64; the start by extension does not take it back."""
+    scene = pbng.Scene(gravity=(0, -9.8, 0))
+    flesh, box = pbng.Corotated(E=1e3, nu=0.3, density=10), pbng.shapes.box(size=(1, 1, 1), vertices=(4, 4, 4))
+    upper, lower, apart = (scene.add(box, flesh, at=at) for at in ((0, 1, 0), (0, 0, 0), (3, 0, 0)))
+    scene.pin(upper.where(y=2.0))
+    scene.bind(lower.where(y=1.0), upper.where(y=1.0), k=1e8)
+    scene.pin(apart.where(y=0.0))
+    scene.move(apart.where(y=1.0), pbng.Translate((0, 0.03, 0)))
+    result = pbng.solve(scene, pbng.MultigridPBNG(), pbng.Budget(rtol=1e-7, iterations=60))
+    assert result.status is pbng.Status.CONVERGED

@@ -38,7 +38,7 @@ def bind(a: Points, b: Any, k: Any, k_n: Any, k_tau: Any, normal: Any) -> Bindin
     if callable(b):
         return Binding(a, None, b, K)
     try:
-        fixed = np.broadcast_to(np.asarray(b, float), (len(a), 3))
+        fixed = np.array(np.broadcast_to(np.asarray(b, float), (len(a), 3)))
     except (TypeError, ValueError):
         raise InputError(
             f"bind: expected points, a body, a selection, a motion or positions ({len(a)}, 3), not {b!r:.80}"

@@ -37,7 +37,7 @@ class Body:
         Raises:
             InputError: Shapes differ, a vertex does not exist, a weight is not finite or a row does not sum to one.
         """
-        return Points(self, np.asarray(vertices), np.asarray(weights, float))
+        return Points(self, np.array(vertices), np.array(weights, float))
 
     @property
     def faces(self) -> np.ndarray:

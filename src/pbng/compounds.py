@@ -17,6 +17,8 @@ from pbng.constraints import WeakConstraints
 from pbng.elements.base import ElementKind
 from pbng.problem import Problem
 
+LINKS = 16  # of a chain of ties that are followed
+
 
 @dataclass(frozen=True, eq=False)
 class CompoundIncidences:
@@ -48,28 +50,18 @@ class Compounds:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        rows, columns, values = [], [], []
-        for w in problem.weak:
-            if w.anchored or w.corners < 2:
-                continue
-            follower = _followers(w)
-            weights = np.where(follower, w.weights, 0.0)
-            share = weights / np.maximum((weights**2).sum(1, keepdims=True), 1e-300)
-            movable = ~(follower & problem.fixed[w.vertices]).any(1)
-            for a in range(w.corners):
-                mine = np.flatnonzero(movable & ~follower[:, a] & ~problem.fixed[w.vertices[:, a]])
-                rows.append(np.repeat(w.vertices[mine, a], w.corners))
-                columns.append(w.vertices[mine].ravel())
-                values.append((-w.weights[mine, a, None] * share[mine]).ravel())
-        leader = np.unique(np.concatenate([np.empty(0, np.int64), *rows]))
+        follows = _follows(problem)
+        leader = np.flatnonzero(np.diff(follows.indptr))
         self.n = len(leader)
-        number = np.full(problem.n_vert, -1)
-        number[leader] = np.arange(self.n)
-        row, column = number[np.concatenate([*rows, leader])], np.concatenate([*columns, leader])
-        value = np.concatenate([*values, np.ones(self.n)])
-        self.beta = scipy.sparse.csr_matrix((value, (row, column)), (self.n, problem.n_vert))
-        self.beta.sum_duplicates()
-        self.beta.eliminate_zeros()
+        ones = np.ones(self.n), (np.arange(self.n), leader)
+        self.beta = further = scipy.sparse.csr_matrix(ones, (self.n, problem.n_vert))
+        for _ in range(LINKS):  # what hangs on what hangs on it; nothing twice, so that rings of ties end
+            further = further @ follows
+            further = further - further.multiply(self.beta != 0)
+            further.eliminate_zeros()
+            if further.nnz == 0:
+                break
+            self.beta = (self.beta + further).tocsr()
 
     @cached_property
     def incidences(self) -> list[CompoundIncidences]:
@@ -99,6 +91,30 @@ class Compounds:
         order = np.argsort(compound, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(compound, minlength=self.n))])
         return color_nodes(np.arange(self.n), [(start, cell[order], 1, int(first[-1]))])
+
+
+def _follows(problem: Problem) -> scipy.sparse.csr_matrix:
+    """How much each vertex (column) has to move with a free one (row) so that the springs between them keep their length,
+    (n_vert, n_vert); the mean, where springs differ."""
+    rows, columns, values = [np.empty(0, int)], [np.empty(0, int)], [np.empty(0)]
+    for w in problem.weak:
+        if w.anchored or w.corners < 2:
+            continue
+        follower = _followers(w)
+        weights = np.where(follower, w.weights, 0.0)
+        share = weights / np.maximum((weights**2).sum(1, keepdims=True), 1e-300)
+        movable = ~(follower & problem.fixed[w.vertices]).any(1) & (np.trace(w.K, axis1=1, axis2=2) > 0)
+        for a in range(w.corners):
+            mine = np.flatnonzero(movable & ~follower[:, a] & ~problem.fixed[w.vertices[:, a]])
+            c, corner = np.nonzero(follower[mine])
+            rows.append(w.vertices[mine[c], a])
+            columns.append(w.vertices[mine[c], corner])
+            values.append(-w.weights[mine[c], a] * share[mine[c], corner])
+    at, value = (np.concatenate(rows), np.concatenate(columns)), np.concatenate(values)
+    shape = problem.n_vert, problem.n_vert
+    total, count = (scipy.sparse.csr_matrix((v, at), shape) for v in (value, np.ones(len(value))))
+    total.data /= count.data
+    return total
 
 
 def _followers(w: WeakConstraints) -> np.ndarray:

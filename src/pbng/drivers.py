@@ -164,6 +164,8 @@ def _moving_frames(
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         yield Frame(k, moving.t, result.x, result, moving.problem, moving.v)
+        if not result.status.ok:
+            return  # the state is lost
 
 
 def _equilibrium(method: Method, x: np.ndarray, t: float, budget: Budget, monitor: Monitor | None) -> Result:

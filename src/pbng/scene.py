@@ -159,7 +159,9 @@ class Scene:
             _check_times("bind", over, start)
             move, X = _Move(np.arange(len(points)), as_motion(b), start, over), points.X
             other = _Prescribed(X, [move])
-        self._bindings.append(bind(points, other, k, k_n, k_tau, normal))
+        binding = bind(points, other, k, k_n, k_tau, normal)
+        weak_constraints([binding])  # says what is wrong with it here, and not when the scene compiles
+        self._bindings.append(binding)
 
     def _checked_points(self, what: str, points: Any) -> Points:
         if isinstance(points, Points):

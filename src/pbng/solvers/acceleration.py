@@ -199,6 +199,8 @@ class _Mixing:
             return
         x[:] = checked[:] = g
         self.energy, self.unchecked = energy, 0
+        if self.softness.succeed():
+            self.history.restart()  # it was that of another map
 
     def settle(self, x: np.ndarray) -> None:
         if self.unchecked and not self._passes(x):
@@ -238,7 +240,7 @@ class Softness:
 
     def fail(self) -> None:
         """Sweeps with ω have raised the energy."""
-        self.omega *= 0.5
+        self.omega = max(0.5 * self.omega, self.most / 4096)
         self.patience = min(2 * self.patience, 256)
         self.wait = self.patience
 
@@ -250,6 +252,8 @@ class Softness:
         if self.wait > 0:
             return False
         self.omega, self.wait = min(2 * self.omega, self.most), self.patience
+        if self.omega == self.most:
+            self.patience = 4
         return True
 
 

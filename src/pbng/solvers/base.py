@@ -158,6 +158,11 @@ class Certificate:
     error: float = math.nan
 
 
+def norm(f: np.ndarray) -> float:
+    """Euclidean norm, summed in an order of its own: threads of BLAS would show in the last bits."""
+    return math.sqrt(float((f * f).sum()))
+
+
 @dataclass(frozen=True)
 class Progress:
     """What a monitor is told: iteration, residual and energy there, the tolerance [N] (-1: none), seconds so far."""

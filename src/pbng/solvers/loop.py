@@ -39,19 +39,22 @@ def run(
             history.add(iteration, method.certify())
 
     certify(0)
-    if method.problem.weak and history.last.residual <= method.floor() and method.refine():
+    refined = method.problem.weak and history.last.residual <= method.floor() and method.refine()
+    if refined:
         # Rounding the ends of stiff springs makes forces as large as those that are to be balanced.
         history = History()
         certify(0)
     first, floor = history.last.residual, method.floor()
     tolerance = budget.tolerance(first)
-    if budget.rtol is not None:
+    if budget.rtol is not None and not method.problem.weak:
         tolerance = max(tolerance, method.floor(np.float64))  # a fraction of rounding cannot be asked for
     status = _verdict(history, tolerance, floor, budget.error)
     iteration, correction = 0, 0.0
     seen = -1, x  # an iteration and the state after it
     if status is None and before is not None and (better := method.prepare(before, x)) is not None:
         method.start(better, targets)
+        if refined:
+            method.refine()
     try:
         while status is None:
             if iteration >= budget.cap:

@@ -22,7 +22,7 @@ from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.problem import Problem
 from pbng.solvers.acceleration import MixingHistory, Softness
-from pbng.solvers.base import Certificate
+from pbng.solvers.base import Certificate, norm
 from pbng.solvers.pbng import PBNG, PackedMethod, checked_dtype
 from pbng.solvers.threads import check_threads
 
@@ -145,7 +145,8 @@ class TwoGrid(PackedMethod):
         np.add(g[:n], self.d, out=z[:n], casting="same_kind")
         self.Ez = self.energy(z)
         if self.Ez <= self.E - DECREASE * slope + tolerance:
-            self.softness.succeed()
+            if self.softness.succeed() and self.history is not None:
+                self.history.restart()  # it was that of another map
             return
         Eg, alpha = self.energy(g), 1.0
         if self.rises(Eg, self.E, self.x):
@@ -181,7 +182,7 @@ class TwoGrid(PackedMethod):
         with self.threads.used():
             f, force_scale, inverted = self.free_forces(self.x)
             self.force_scale = force_scale
-            return Certificate(float(np.linalg.norm(f)), self.E, force_scale, inverted, self._error(f))
+            return Certificate(norm(f), self.E, force_scale, inverted, self._error(f))
 
     def _error(self, f: np.ndarray) -> float:
         """Estimate of the largest position error [m].

@@ -14,7 +14,7 @@ from pbng.jit import compile_seconds
 from pbng.packing import Packed, pack_problem
 from pbng.problem import Problem
 from pbng.solvers.acceleration import Acceleration, Anderson, Iteration, NodeSOR
-from pbng.solvers.base import Certificate
+from pbng.solvers.base import Certificate, norm
 from pbng.solvers.threads import FIRST_PROBE, Threads, check_threads
 from pbng.sweep import sweep
 
@@ -166,7 +166,7 @@ class PackedMethod:
         with self.threads.used():
             f, force_scale, inverted = self.free_forces(self.x)
             self.known_energy, self.force_scale = self.energy(self.x), force_scale
-            return Certificate(float(np.linalg.norm(f)), self.known_energy, force_scale, inverted)
+            return Certificate(norm(f), self.known_energy, force_scale, inverted)
 
     def free_forces(self, x: np.ndarray) -> tuple[np.ndarray, float, int]:
         """Total forces on the free vertices [N], flat, with the force scale [N] and the number of inverted elements."""
@@ -206,4 +206,4 @@ class PackedMethod:
 
     def _work(self, x: np.ndarray) -> float:
         """Work [J] of the external forces since rest."""
-        return float(self.f_ext @ (x - self.blocks.X)) if self.loaded else 0.0
+        return float((self.f_ext * (x - self.blocks.X)).sum()) if self.loaded else 0.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbng.jit import compile_seconds
 from pbng.problem import Problem
-from pbng.solvers.base import Certificate
+from pbng.solvers.base import Certificate, norm
 from pbng.solvers.threads import FIRST_PROBE, Threads
 
 
@@ -55,7 +55,7 @@ class VertexMethod:
         with self.threads.used(), np.errstate(all="ignore"):  # what overflows is not finite, and seen
             f, force_scale, inverted = self.total_forces(self.x)
             energy = self.problem.energy(self.x, self.targets)
-            return Certificate(float(np.linalg.norm(f[self.free])), energy, force_scale, inverted)
+            return Certificate(norm(f[self.free]), energy, force_scale, inverted)
 
     def total_forces(self, x: np.ndarray) -> tuple[np.ndarray, float, int]:
         """Internal and external forces (n_vert, 3) [N], the force scale [N] and the number of inverted elements."""
