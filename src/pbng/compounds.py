@@ -94,8 +94,10 @@ class Compounds:
 
 
 def _follows(problem: Problem) -> scipy.sparse.csr_matrix:
-    """How much each vertex (column) has to move with a free one (row) so that the springs between them keep their length,
-    (n_vert, n_vert); the mean, where springs differ."""
+    """How much each vertex (column) has to move with a free one (row) for the springs between them to keep their length.
+
+    (n_vert, n_vert) sparse; the mean, where springs differ.
+    """
     rows, columns, values = [np.empty(0, int)], [np.empty(0, int)], [np.empty(0)]
     for w in problem.weak:
         if w.anchored or w.corners < 2:
