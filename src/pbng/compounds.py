@@ -94,7 +94,7 @@ class Compounds:
 
 
 def _follows(problem: Problem) -> scipy.sparse.csr_matrix:
-    """How much each vertex (column) has to move with a free one (row) for the springs between them to keep their length.
+    """How much each vertex (column) has to move with a free one (row) for springs between them to keep their length.
 
     (n_vert, n_vert) sparse; the mean, where springs differ.
     """
