@@ -123,6 +123,17 @@ def det(F):
 
 
 @leaf
+def adjugate(a):
+    """Adjugate, A⁻¹ det A, of a matrix of nine numbers by rows, likewise by rows; and det A."""
+    c0, c1, c2 = a[4] * a[8] - a[5] * a[7], a[5] * a[6] - a[3] * a[8], a[3] * a[7] - a[4] * a[6]
+    return (
+        (c0, a[2] * a[7] - a[1] * a[8], a[1] * a[5] - a[2] * a[4]),
+        (c1, a[0] * a[8] - a[2] * a[6], a[2] * a[3] - a[0] * a[5]),
+        (c2, a[1] * a[6] - a[0] * a[7], a[0] * a[4] - a[1] * a[3]),
+    ), a[0] * c0 + a[1] * c1 + a[2] * c2
+
+
+@leaf
 def _halley(s, I1, I2, J):
     """One Halley step for the largest root of s⁴ - 2 I1 s² - 8 J s + I1² - 4 I2; from above it stays above.
 

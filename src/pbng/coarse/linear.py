@@ -12,6 +12,7 @@ from threadpoolctl import ThreadpoolController
 
 from pbng.coarse.grid import Grid
 from pbng.jit import serial
+from pbng.linalg import adjugate, scale
 from pbng.parallel import array, body, each, rows
 
 # On few cores threads of BLAS only get in the way of Numba's, and their number would show in the last bits.
@@ -176,20 +177,12 @@ def _raise_diagonal(diagonal, value, least):
 def _invert_diagonal(diagonal, value, inverse):
     for r in range(diagonal.size):
         a = value[diagonal[r]]
-        c0, c1, c2 = a[4] * a[8] - a[5] * a[7], a[5] * a[6] - a[3] * a[8], a[3] * a[7] - a[4] * a[6]
-        d = 1 / (a[0] * c0 + a[1] * c1 + a[2] * c2)
+        adj, det = adjugate(a)
+        d = 1 / det
         i = inverse[r]
-        i[0], i[3], i[6] = c0 * d, c1 * d, c2 * d
-        i[1], i[4], i[7] = (
-            (a[2] * a[7] - a[1] * a[8]) * d,
-            (a[0] * a[8] - a[2] * a[6]) * d,
-            (a[1] * a[6] - a[0] * a[7]) * d,
-        )
-        i[2], i[5], i[8] = (
-            (a[1] * a[5] - a[2] * a[4]) * d,
-            (a[2] * a[3] - a[0] * a[5]) * d,
-            (a[0] * a[4] - a[1] * a[3]) * d,
-        )
+        for k in range(3):
+            row = scale(d, adj[k])
+            i[3 * k], i[3 * k + 1], i[3 * k + 2] = row
 
 
 @body

@@ -4,6 +4,7 @@ import numpy as np
 from numba import uint64
 
 from pbng.jit import inline
+from pbng.linalg import adjugate, scale
 from pbng.parallel import array, body, each, rows, run
 from pbng.stiffness import BlockMatrix
 
@@ -69,24 +70,15 @@ def _invert(arguments, low, high):
     definite = array(arguments, 4, np.bool_)
     for r in range(low, high):
         a, i = value[diagonal[r]], inverse[r]
-        c0, c1, c2 = a[4] * a[8] - a[5] * a[7], a[5] * a[6] - a[3] * a[8], a[3] * a[7] - a[4] * a[6]
-        det = a[0] * c0 + a[1] * c1 + a[2] * c2
+        adj, det = adjugate(a)
         size = max(abs(a[0]), abs(a[4]), abs(a[8]))
         least = SINGULAR * size * size * size
         definite[r] = a[0] > 0 and a[0] * a[4] - a[1] * a[3] > 0 and det > least
         if definite[r] or (not positive and abs(det) > least):
             d = 1 / det
-            i[0], i[3], i[6] = c0 * d, c1 * d, c2 * d
-            i[1], i[4], i[7] = (
-                (a[2] * a[7] - a[1] * a[8]) * d,
-                (a[0] * a[8] - a[2] * a[6]) * d,
-                (a[1] * a[6] - a[0] * a[7]) * d,
-            )
-            i[2], i[5], i[8] = (
-                (a[1] * a[5] - a[2] * a[4]) * d,
-                (a[2] * a[3] - a[0] * a[5]) * d,
-                (a[0] * a[4] - a[1] * a[3]) * d,
-            )
+            for k in range(3):
+                row = scale(d, adj[k])
+                i[3 * k], i[3 * k + 1], i[3 * k + 2] = row
         else:
             i[:] = 0.0
             i[0] = i[4] = i[8] = 1 / size if size > 0 else 0.0
