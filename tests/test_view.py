@@ -264,13 +264,13 @@ def test_a_film_that_fails_leaves_nothing(tmp_path, monkeypatch):
     with FrameWriter(tmp_path / "run") as out:
         for frame in frames([box((2, 2, 2))], 3):
             out.write(frame)
-    draw, motion = render._Artist.draw, Run(tmp_path / "run")
+    draw, motion = render.Artist.draw, Run(tmp_path / "run")
 
     def damage(*args):
         (tmp_path / "run" / "frame_000002.npz").write_bytes(b"")
         return draw(*args)
 
-    monkeypatch.setattr(render._Artist, "draw", damage)
+    monkeypatch.setattr(render.Artist, "draw", damage)
     with pytest.raises(InputError, match="frame_000002"):
         views.film(motion, tmp_path / "a.mp4", size=(64, 64))
     assert [entry.name for entry in tmp_path.iterdir()] == ["run"]

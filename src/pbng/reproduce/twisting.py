@@ -214,17 +214,17 @@ def portraits(shown: Sequence[Portrait], path: Path, columns: int = 3) -> Path:
     from PIL import Image
 
     from pbng.view.plots import caption, over
-    from pbng.view.render import BAR, _Artist, _faded
+    from pbng.view.render import BAR, Artist, faded
     from pbng.view.surface import Motion
 
     low, high = (f([f(p.fit, axis=0) for p in shown], axis=0) for f in (np.min, np.max))
     size = float((high - low).max())
     room = ROOM * size * np.concatenate([np.eye(3), -np.eye(3)])
-    artists: dict[int, _Artist] = {}
+    artists: dict[int, Artist] = {}
     for p in shown:
         if id(p.problem) not in artists:
             motion = Motion.of([State(p.problem, p.fit + d) for d in room])
-            artists[id(p.problem)] = _Artist(motion, "stretch", None, 28.0, 20.0)
+            artists[id(p.problem)] = Artist(motion, "stretch", None, 28.0, 20.0)
     bars = [a.paint.bar for a in artists.values() if a.paint.bar]
     scale = min(b[0] for b in bars), max(b[1] for b in bars)
     columns = min(columns, len(shown))
@@ -236,7 +236,7 @@ def portraits(shown: Sequence[Portrait], path: Path, columns: int = 3) -> Path:
             artist, stage = artists[id(p.problem)], stages[id(p.problem)]
             artist.paint.bar = scale
             x = np.clip(np.where(np.isfinite(p.x), p.x, p.fit), low - CUT * size, high + CUT * size)
-            image = _faded(artist.draw(stage, State(p.problem, x, p.t), bar=False))
+            image = faded(artist.draw(stage, State(p.problem, x, p.t), bar=False))
             row, column = k // columns * height, k % columns * width
             page[row : row + height, column : column + width] = over(image, caption(TILE, p.words, UNIT))
     artist = artists[id(shown[0].problem)]

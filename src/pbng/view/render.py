@@ -56,7 +56,7 @@ def picture(
     if not -len(motion) <= frame < len(motion):
         raise InputError(f"no frame {frame} in a run of {len(motion)}")
     path = _ready(path)
-    artist = _Artist(motion, color, edges, azimuth, elevation)
+    artist = Artist(motion, color, edges, azimuth, elevation)
     with artist.stage(size) as stage:
         return _save(artist.draw(stage, motion.frames[frame]), path)
 
@@ -80,7 +80,7 @@ def film(
     motion = Motion.of(source)
     size = size[0] + size[0] % 2, size[1] + size[1] % 2
     path = _ready(path)
-    artist = _Artist(motion, color, edges, azimuth, elevation)
+    artist = Artist(motion, color, edges, azimuth, elevation)
     with artist.stage(size, sampling=2) as stage, Video(path, size, motion.fps if fps is None else fps) as video:
         for k in _shown(range(len(motion)), path.name):
             video.write(artist.draw(stage, motion.frames[k]))
@@ -109,7 +109,7 @@ def sheet(
         raise InputError(f"there are {len(captions)} captions for {len(motion)} frames")
     chosen = np.unique(np.linspace(0, len(motion) - 1, max(1, min(frames, len(motion)))).round().astype(int))
     path = _ready(path)
-    artist = _Artist(motion, color, edges, azimuth, elevation)
+    artist = Artist(motion, color, edges, azimuth, elevation)
     unit = width / 1600
     room = round(BAR * unit) if artist.paint.bar else 0
     columns, tile = _tiles(len(chosen), artist.aspect(), width - room)
@@ -119,7 +119,7 @@ def sheet(
             frame = motion.frames[k]
             row, column = i // columns * tile[1], i % columns * tile[0]
             words = f"t = {frame.t:.2f} s" if captions is None else captions[k]
-            image = over(_faded(artist.draw(stage, frame, bar=False)), caption(tile, words, unit))
+            image = over(faded(artist.draw(stage, frame, bar=False)), caption(tile, words, unit))
             page[row : row + tile[1], column : column + tile[0]] = image
     return _save(artist.with_bar(page, unit), path)
 
@@ -140,7 +140,7 @@ def view(source: Any, out: str | os.PathLike[str] | None = None) -> list[Path]:
     return [*written, plot_residuals(series, folder / "residuals.png", xlabel, "residual [N]", run.name)]
 
 
-class _Artist:
+class Artist:
     """What is the same in all pictures of a motion: its surface, colours, and what it sweeps."""
 
     def __init__(self, motion: Motion, color: str, edges: bool | None, azimuth: float, elevation: float) -> None:
@@ -222,7 +222,7 @@ def _tiles(n: int, aspect: float, width: int) -> tuple[int, tuple[int, int]]:
     return columns, (across, round(across / aspect * 1.12))
 
 
-def _faded(image: np.ndarray) -> np.ndarray:
+def faded(image: np.ndarray) -> np.ndarray:
     """The image turning white towards its edges, within the margins, so that no seam shows between tiles."""
     ramps = [np.clip((np.minimum(k := np.arange(n), n - 1 - k)) / (1.3 * MARGIN * n), 0, 1) for n in image.shape[:2]]
     rows, columns = (ramp * ramp * (3 - 2 * ramp) for ramp in ramps)
