@@ -74,6 +74,7 @@ def outer_sum(a, ga, b, gb, e, ge):
 
 @inline
 def corner(X, i):
+    """Vertex i of flat rest positions."""
     return X[3 * i], X[3 * i + 1], X[3 * i + 2]
 
 

@@ -90,6 +90,7 @@ def make_change(key: str) -> Any:
 
 @inline
 def vector_at(a, at, stride):
+    """The vector whose entries stand from ``at`` on, a stride apart."""
     return a[at], a[at + stride], a[at + stride + stride]
 
 
@@ -102,6 +103,7 @@ def matrix_at(a, at, stride):
 
 @inline
 def put(a, at, v):
+    """Write the vector v of one lane to ``a[at:]``."""
     a[at], a[at + uint64(W)], a[at + uint64(2 * W)] = v
 
 
@@ -113,6 +115,7 @@ def load(a, j, l):
 
 @inline
 def save(a, j, l, v):
+    """Write v as the vector at position j of lane l."""
     put(a, uint64(W) * uint64(j) + l, v)
 
 

@@ -104,7 +104,7 @@ class PackedMethod:
         self.forces = np.empty(4 * self.packed.n_slot)
         self.load = float(np.linalg.norm(problem.f_ext, axis=1).sum())
         self.force_scale = 0.0  # of the last certificate [N]
-        self.targets = np.zeros((problem.n_target, 3))
+        self.targets = self.ends = np.zeros((problem.n_target, 3))
         self.x = self.packed.pack(problem.X, self.targets)
         self.iteration: Iteration | None = None
         self.known_energy, self.trust = math.inf, 0
@@ -115,6 +115,7 @@ class PackedMethod:
 
     def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
         self.targets = self.problem.targets(self.problem.end) if targets is None else targets
+        self.ends = self.targets - self.packed.origin  # relative to it, as positions are kept
         self.prescribed = np.array(x[self.problem.fixed], float)
         self.packed = self.layout("float32" if self.solver.dtype == "auto" else self.solver.dtype)
         self.begin(x)
@@ -160,7 +161,7 @@ class PackedMethod:
 
     def energy(self, x: np.ndarray) -> float:
         energy = self.blocks.energy(x) - self._work(x)
-        return energy + self.weak.energy(self._places(x), self.targets - self.packed.origin) if self.weak else energy
+        return energy + self.weak.energy(self._places(x), self.ends) if self.weak else energy
 
     def certify(self) -> Certificate:
         with self.threads.used():
@@ -172,7 +173,7 @@ class PackedMethod:
         """Total forces on the free vertices [N], flat, with the force scale [N] and the number of inverted elements."""
         force_scale, inverted = self.blocks.forces(x, self.forces)
         if self.weak:
-            weak, scale = self.weak.forces(self._places(x), self.targets - self.packed.origin)
+            weak, scale = self.weak.forces(self._places(x), self.ends)
             self.forces.reshape(-1, 4)[:, :3] += weak
             force_scale += scale
         return self.forces[: self.n_free] + self.f_ext[: self.n_free], force_scale, inverted
