@@ -8,6 +8,7 @@ after all blocks, and the targets of weak constraints after them.
 """
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,6 +44,8 @@ class Packed:
         n_target: Number of targets, the last slots.
         n_color: Colours of vertices; those that follow are of compound nodes.
         carried: For each of these the places of the vertices that it moves, of the compounds, and the shares.
+        layout: What lays out further blocks of the same nodes.
+        places: Number of each vertex, and then of each target.
     """
 
     slot: np.ndarray
@@ -62,6 +65,8 @@ class Packed:
     n_target: int
     n_color: int
     carried: tuple
+    layout: "Layout"
+    places: np.ndarray
 
     @property
     def dtype(self) -> np.dtype:
@@ -101,45 +106,105 @@ def aligned(n: int, dtype) -> np.ndarray:
     return raw[shift : shift + n * size].view(dtype)
 
 
-def pack_problem(problem: Problem, dtype=np.float32, paper_block: bool = False) -> Packed:
+class Layout:
+    """What the nodes of a problem see, ready to be laid out for any choice of nodes.
+
+    Args:
+        problem: What is laid out.
+        dtype: Precision of the rows.
+        paper_block: Take Eq. (32) in place of the majorising block.
+        compounds: Nodes besides the vertices, numbered on from them.
+    """
+
+    def __init__(self, problem: Problem, dtype: Any, paper_block: bool, compounds: Compounds | None) -> None:
+        self.problem, self.dtype = problem, np.dtype(dtype)
+        self.groups = Groups(problem, dtype, paper_block, compounds is not None)
+        self.families = families(problem, compounds)
+        self.f_ext = problem.f_ext
+        if compounds:
+            self.f_ext = np.concatenate([self.f_ext, compounds.beta @ self.f_ext])
+        self.valence = np.zeros(problem.n_vert, np.int64)
+        self.touched = np.zeros(problem.n_vert, np.int64)  # a hash of the groups a vertex touches
+        for n, cells in enumerate([g.cells for g in problem.groups] + [w.vertices for w in problem.weak]):
+            mine = np.bincount(cells.ravel(), minlength=problem.n_vert)
+            self.valence += mine
+            self.touched += (mine > 0) * (1 << min(n, 62))
+
+    def numbering(self, order: np.ndarray, color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """First block of each colour, and the vertex in each place of the blocks, -1 in padding lanes.
+
+        ``order`` lists the vertices, and ``color`` (n_vert,) their colours.
+        """
+        several = len(self.groups.table) > 1
+        node, color_start = [], [0]
+        color = color[order]
+        for c in range(color.max() + 1 if len(order) else 0):
+            mine = order[color == c]
+            if several:
+                mine = mine[np.argsort(self.touched[mine], kind="stable")]
+            window = np.arange(len(mine)) // WINDOW
+            mine = mine[np.lexsort((-self.valence[mine], self.touched[mine] if several else window, window))]
+            node.append(np.concatenate([mine, np.full(-len(mine) % W, -1)]))
+            color_start.append(color_start[-1] + len(node[-1]) // W)
+        return np.array(color_start), np.concatenate(node) if node else np.empty(0, np.int64)
+
+    def rows(self, node: np.ndarray, places: np.ndarray, n_block: int) -> "Rows":
+        """The rows of blocks of nodes (n,), -1 in padding lanes, the first ``n_block`` of which are of vertices.
+
+        ``places`` are the numbers of vertices and then targets in position arrays.
+        """
+        real = node >= 0
+        owner = np.where(real, node, np.repeat(node[::W], W))  # padding lanes repeat the first of their block
+        spans, n_idx, n_coef = _layout(self.families, owner, self.groups.table)
+        idx, coef = aligned(n_idx, np.uint32), aligned(n_coef, self.dtype)
+        nodal = np.zeros((len(node) // W, NODAL, W))
+        nodal[:, :3] = self.f_ext[owner].reshape(-1, W, 3).transpose(0, 2, 1) * real.reshape(-1, 1, W)
+        stiffness = []
+        for elastic in (True, False):
+            for family, span in zip(self.families, spans):
+                if family.elastic == elastic:
+                    _fill(family, span, self.problem.X, owner, real, places, self.groups, idx, coef, nodal)
+            stiffness.append((nodal[:n_block, 3] + nodal[:n_block, 6] + nodal[:n_block, 8]).ravel() / 3)
+        seg_start, seg = spans[0] if len(spans) == 1 else _merge(spans)
+        nodal = _padded(nodal, real).astype(self.dtype).ravel()
+        return Rows(seg_start, seg[:, :5].copy(), idx, coef, nodal, stiffness[0], stiffness[1] - stiffness[0])
+
+
+class Rows(NamedTuple):
+    """What :meth:`Layout.rows` makes; see :class:`Packed`."""
+
+    seg_start: np.ndarray
+    seg: np.ndarray
+    idx: np.ndarray
+    coef: np.ndarray
+    nodal: np.ndarray
+    stiffness: np.ndarray
+    weak_stiffness: np.ndarray
+
+
+def pack_problem(problem: Problem, dtype: Any = np.float32, paper_block: bool = False) -> Packed:
     """Colour a problem and lay it out; ``paper_block`` takes Eq. (32) in place of the majorising block."""
     compounds = Compounds(problem) if problem.weak else None
     compounds = compounds if compounds and compounds.n else None
-    color_start, node = _numbering(problem)
+    layout = Layout(problem, dtype, paper_block, compounds)
+    color_start, node = layout.numbering(problem.order[problem.color[problem.order] >= 0], problem.color)
     n_color, n_block = len(color_start) - 1, len(node) // W
-    f_ext = problem.f_ext
     if compounds:
         node, color_start = _with_compounds(problem, compounds, node, color_start)
-        f_ext = np.concatenate([f_ext, compounds.beta @ f_ext])
     real = node >= 0
-    place = np.full(len(f_ext), -1, np.int64)  # of vertices, then of compounds
+    place = np.full(len(layout.f_ext), -1, np.int64)  # of vertices, then of compounds
     place[node[real]] = np.flatnonzero(real)
     rest = np.flatnonzero(place < 0)
     place[rest] = len(node) + np.arange(len(rest))
     slot = place[: problem.n_vert].copy()
-    owner = np.where(real, node, np.repeat(node[::W], W))  # padding lanes repeat the first of their block
     n_slot = len(node) + len(rest) + problem.n_target
     places = np.concatenate([slot, np.arange(n_slot - problem.n_target, n_slot)])
-
-    groups = Groups(problem, dtype, paper_block, compounds is not None)
-    seen = families(problem, compounds)
-    spans, n_idx, n_coef = _layout(seen, owner, groups.table)
-    idx, coef = aligned(n_idx, np.uint32), aligned(n_coef, dtype)
-    nodal = np.zeros((len(node) // W, NODAL, W))
-    nodal[:, :3] = f_ext[owner].reshape(-1, W, 3).transpose(0, 2, 1) * real.reshape(-1, 1, W)
-    stiffness = []
-    for elastic in (True, False):
-        for family, span in zip(seen, spans):
-            if family.elastic == elastic:
-                _fill(family, span, problem.X, owner, real, places, groups, idx, coef, nodal)
-        stiffness.append((nodal[:n_block, 3] + nodal[:n_block, 6] + nodal[:n_block, 8]).ravel() / 3)
-    seg_start, seg = spans[0] if len(spans) == 1 else _merge(spans)
-    seg = seg[:, :5].copy()
+    rows = layout.rows(node, places, n_block)
     return Packed(
-        slot, origin_of(problem.X), n_slot, n_block, color_start, seg_start, seg, idx, coef,
-        _padded(nodal, real).astype(dtype).ravel(), groups.parameters, groups.functions,
-        stiffness[0], stiffness[1] - stiffness[0], problem.n_target, n_color,
-        _carried(compounds, place, color_start[n_color:], np.dtype(dtype)) if compounds else (),
+        slot, origin_of(problem.X), n_slot, n_block, color_start, *rows[:5],
+        layout.groups.parameters, layout.groups.functions, rows.stiffness, rows.weak_stiffness, problem.n_target,
+        n_color, _carried(compounds, place, color_start[n_color:], np.dtype(dtype)) if compounds else (),
+        layout, places,
     )  # fmt: skip
 
 
@@ -196,28 +261,6 @@ def origin_of(X: np.ndarray) -> np.ndarray:
     low, high = X.min(0), X.max(0)
     far = np.abs(X).max() > 4 * (high - low).max()
     return (low + high) / 2 if far else np.zeros(3)
-
-
-def _numbering(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """First block of each colour, and the vertex in each place of the blocks, -1 in padding lanes."""
-    color = problem.color
-    valence = np.zeros(problem.n_vert, np.int64)
-    touched = np.zeros(problem.n_vert, np.int64)  # a hash of the groups a vertex touches
-    for n, cells in enumerate([g.cells for g in problem.groups] + [w.vertices for w in problem.weak]):
-        mine = np.bincount(cells.ravel(), minlength=problem.n_vert)
-        valence += mine
-        touched += (mine > 0) * (1 << min(n, 62))
-    order, several = problem.order, len(problem.groups) + len(problem.weak) > 1
-    node, color_start = [], [0]
-    for c in range(color.max() + 1 if len(color) else 0):
-        mine = order[color[order] == c]
-        if several:
-            mine = mine[np.argsort(touched[mine], kind="stable")]
-        window = np.arange(len(mine)) // WINDOW
-        mine = mine[np.lexsort((-valence[mine], touched[mine] if several else window, window))]
-        node.append(np.concatenate([mine, np.full(-len(mine) % W, -1)]))
-        color_start.append(color_start[-1] + len(node[-1]) // W)
-    return np.array(color_start), np.concatenate(node) if node else np.empty(0, np.int64)
 
 
 def _padded(nodal: np.ndarray, real: np.ndarray) -> np.ndarray:
