@@ -7,6 +7,7 @@ import numpy as np
 
 from pbng.errors import InputError
 from pbng.materials.base import Material
+from pbng.materials.bending import Bending
 from pbng.mesh import Mesh, TriMesh
 
 ROUNDING = 1e-9  # what weights that should sum to one may be off by
@@ -20,6 +21,32 @@ class Body:
     mesh: Mesh
     materials: tuple[tuple[Material, np.ndarray], ...]  # with the cells each holds for
     start: int  # number of its first vertex in the scene
+    bending: Bending | None = None  # of cloth
+
+    def __post_init__(self) -> None:
+        """Check that mesh, materials and bending go together.
+
+        Raises:
+            InputError: They do not, or cloth has an edge of more than two triangles or neighbours not oriented alike.
+        """
+        who, surface = f"body {self.name!r}", [m for m, _ in self.materials if m.surface]
+        if surface and not isinstance(self.mesh, TriMesh):
+            raise InputError(f"{who}: {type(surface[0]).__name__} is a material of surfaces, and its mesh is of tets")
+        if surface and len(surface) < len(self.materials):
+            raise InputError(f"{who}: some of its materials are of surfaces and some are not")
+        if self.bending is not None and not isinstance(self.bending, Bending):
+            raise InputError(f"{who}: expected Bending(k=...) after the material, not {self.bending!r}")
+        if self.bending is not None and not surface:
+            raise InputError(f"{who}: bending is for cloth; its material must be of surfaces, such as Membrane")
+        if isinstance(self.mesh, TriMesh) and not surface and not self.mesh.is_plane:
+            raise InputError(
+                f"{who}: a solid in two dimensions must lie in a plane of constant z; for cloth take Membrane"
+            )
+        if surface:
+            try:
+                self.mesh.hinges  # noqa: B018
+            except InputError as error:
+                raise InputError(f"{who}: {error}") from None
 
     def where(self, *which: Any, **conditions: Any) -> "Selection":
         """Vertices of this body, chosen as by :meth:`pbng.mesh.Mesh.where`."""
@@ -40,9 +67,15 @@ class Body:
         return Points(self, np.array(vertices), np.array(weights, float))
 
     @property
+    def is_cloth(self) -> bool:
+        """Whether it is a surface in space: triangles of a material of surfaces."""
+        return any(m.surface for m, _ in self.materials)
+
+    @property
     def faces(self) -> np.ndarray:
-        """What bounds it: triangles (k, 3), or in the plane edges (k, 2), by its own vertices."""
-        return self.mesh.boundary_edges if isinstance(self.mesh, TriMesh) else self.mesh.surface
+        """What bounds it, of cloth all of it: triangles (k, 3), or in the plane edges (k, 2), by its own vertices."""
+        plane = isinstance(self.mesh, TriMesh) and not self.is_cloth
+        return self.mesh.boundary_edges if plane else self.mesh.surface
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,6 +100,49 @@ def color_constraints(stencils: Sequence[np.ndarray], n_vert: int) -> np.ndarray
 
 
 @serial
+def recolor(nodes, color, start, neighbour, stencils, among):
+    """Change the colours of nodes, in place and in order, where another of ``among`` that it meets has the same.
+
+    Args:
+        nodes: The nodes to look at, (k,).
+        color: Colours of all nodes, (n_vert,).
+        start, neighbour: Whom each node meets in cells that stay, in compressed rows.
+        stencils: Cells that come and go, (m, s).
+        among: Which nodes count, (n_vert,) bool.
+    """
+    n_vert, m = color.size, stencils.shape[0]
+    first = np.zeros(n_vert + 1, np.int64)
+    for c in range(m):
+        for a in range(stencils.shape[1]):
+            first[stencils[c, a] + 1] += 1
+    for v in range(n_vert):
+        first[v + 1] += first[v]
+    position = first[:-1].copy()
+    cell = np.empty(first[n_vert], np.int64)
+    for c in range(m):
+        for a in range(stencils.shape[1]):
+            cell[position[stencils[c, a]]] = c
+            position[stencils[c, a]] += 1
+    one = np.uint64(1)
+    for v in nodes:
+        taken = np.uint64(0)
+        for k in range(start[v], start[v + 1]):
+            u = neighbour[k]
+            if among[u]:
+                taken |= one << np.uint64(color[u])
+        for k in range(first[v], first[v + 1]):
+            for a in range(stencils.shape[1]):
+                u = stencils[cell[k], a]
+                if among[u] and u != v:
+                    taken |= one << np.uint64(color[u])
+        if (taken >> np.uint64(color[v])) & one:
+            c = 0
+            while c < 63 and (taken >> np.uint64(c)) & one:
+                c += 1
+            color[v] = c
+
+
+@serial
 def _first_conflict(cells, color):
     for e in range(cells.shape[0]):
         for a in range(cells.shape[1]):

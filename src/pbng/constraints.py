@@ -146,14 +146,20 @@ class WeakEnergy:
     def hessian(self, U: scipy.sparse.csr_matrix | None = None) -> scipy.sparse.bsr_matrix:
         """Hessian [N/m] in blocks of 3x3, (3 n, 3 n), or U'HU for interpolation weights U (n, k): it is constant."""
         W = (self.weights if U is None else self.weights @ U).tocsr()
-        k, unit, m = self.k.copy(), np.eye(3), len(self.directed)
+        k = self.k.copy()
         k[self.directed] = 0
-        total = _blocks(W.T @ scipy.sparse.diags(k) @ W, unit)
-        if m:
-            B = _blocks(W[self.directed], unit)
-            K = scipy.sparse.bsr_matrix((self.K[self.directed], np.arange(m), np.arange(m + 1)), shape=(3 * m, 3 * m))
-            total = total + B.T.tobsr((3, 3)) @ (K @ B)
+        total = _blocks(W.T @ scipy.sparse.diags(k) @ W, np.eye(3))
+        if len(self.directed):
+            total = total + stencil_hessian(W[self.directed], self.K[self.directed])
         return total.tobsr((3, 3))
+
+
+def stencil_hessian(W: scipy.sparse.csr_matrix, K: np.ndarray) -> scipy.sparse.bsr_matrix:
+    """Σ (w ⊗ I) K (w ⊗ I)ᵀ over stencils with weights W (m, n) and matrices K (m, 3, 3), in blocks of 3x3."""
+    m = len(K)
+    B = _blocks(W, np.eye(3))
+    stiffness = scipy.sparse.bsr_matrix((K, np.arange(m), np.arange(m + 1)), shape=(3 * m, 3 * m))
+    return (B.T.tobsr((3, 3)) @ (stiffness @ B)).tobsr((3, 3))
 
 
 def _blocks(matrix: scipy.sparse.csr_matrix, block: np.ndarray) -> scipy.sparse.bsr_matrix:

@@ -3,16 +3,17 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from pbng.dynamics import BackwardEuler, steps_of, velocities
+from pbng.equilibrium import ContactReport, Equilibria, Toucher, equilibrium
 from pbng.errors import InputError
 from pbng.problem import Problem
 from pbng.scene import Scene
 from pbng.solvers.base import Budget, Method, Monitor, Result, Solver, Status
-from pbng.solvers.loop import run
 from pbng.solvers.multigrid import MultigridPBNG
 from pbng.solvers.pbng import PBNG
 
@@ -22,7 +23,7 @@ class Frame:
     """One frame of a simulation: its number, time [s], positions (n_vert, 3) [m] of all bodies, and certificate.
 
     With inertia there are velocities v (n_vert, 3) [m/s] too, and the energy of the result is the incremental potential
-    of the last step.
+    of the last step. Where something may touch, ``contact`` reports what did.
     """
 
     index: int
@@ -31,6 +32,7 @@ class Frame:
     result: Result
     problem: Problem
     v: np.ndarray | None = None
+    contact: ContactReport | None = None
 
     @property
     def potential_energy(self) -> float:
@@ -81,10 +83,12 @@ def solve(
     Raises:
         InputError: The scene or the start is not usable.
     """
-    problem = scene.compile() if isinstance(scene, Scene) else scene
+    problem = scene.compile(at=at or 0.0) if isinstance(scene, Scene) else scene
     x, budget = _start(problem, start), budget or Budget()
     method = (solver or default_solver(budget)).set_up(problem)
-    return _timed(method, _equilibrium(method, x, problem.end if at is None else at, budget, monitor))
+    t = problem.end if at is None else at
+    toucher = Toucher(problem, method) if problem.contact else None
+    return _timed(method, equilibrium(method, toucher, x, 0.0, t, budget, monitor))
 
 
 def simulate(
@@ -126,11 +130,12 @@ def simulate(
     problem = scene.compile(free=inertia) if isinstance(scene, Scene) else scene
     x, budget = _start(problem, start), budget or Budget()
     solver = solver or default_solver(budget)
+    later = partial(scene.compile, inertia) if isinstance(scene, Scene) else None
     if inertia:
         steps = steps_of(fps, dt, substeps)
-        moving = BackwardEuler(problem, solver, 1 / (fps * steps), x, velocities(problem, velocity))
+        moving = BackwardEuler(problem, solver, 1 / (fps * steps), x, velocities(problem, velocity), later)
         return _moving_frames(moving, steps, budget, frames, monitor)
-    return _frames(solver.set_up(problem), x, budget, frames, fps, monitor)
+    return _frames(Equilibria(problem, solver, x, later), budget, frames, fps, monitor)
 
 
 def default_solver(budget: Budget) -> Solver:
@@ -142,36 +147,28 @@ def default_solver(budget: Budget) -> Solver:
 
 
 def _frames(
-    method: Method, x: np.ndarray, budget: Budget, frames: int, fps: float, monitor: Monitor | None
+    equilibria: Equilibria, budget: Budget, frames: int, fps: float, monitor: Monitor | None
 ) -> Iterator[Frame]:
     for k in range(frames):
-        t = k / fps
-        result = _equilibrium(method, x, t, budget, monitor)
+        result, report = equilibria.at(k / fps, budget, monitor)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        result = _timed(method, result) if k == 0 else result
-        yield Frame(k, t, result.x, result, method.problem)
-        x = result.x
+        result = _timed(equilibria.method, result) if k == 0 else result
+        yield Frame(k, k / fps, result.x, result, equilibria.problem, contact=report)
 
 
 def _moving_frames(
     moving: BackwardEuler, steps: int, budget: Budget, frames: int, monitor: Monitor | None
 ) -> Iterator[Frame]:
     first = _timed(moving.method, moving.look())
-    yield Frame(0, 0.0, moving.x, first, moving.problem, moving.v)
+    yield Frame(0, 0.0, moving.x, first, moving.problem, moving.v, moving.report())
     for k in range(1, frames):
         result = moving.advance(steps, budget, monitor)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        yield Frame(k, moving.t, result.x, result, moving.problem, moving.v)
+        yield Frame(k, moving.t, result.x, result, moving.problem, moving.v, moving.report())
         if not result.status.ok:
             return  # the state is lost
-
-
-def _equilibrium(method: Method, x: np.ndarray, t: float, budget: Budget, monitor: Monitor | None) -> Result:
-    """The equilibrium at time t, from the state x before the prescribed vertices moved to where they then belong."""
-    problem = method.problem
-    return run(method, problem.constrain(x, t), budget, monitor, before=x, targets=problem.targets(t))
 
 
 def _timed(method: Method, result: Result) -> Result:

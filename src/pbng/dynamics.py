@@ -1,16 +1,21 @@
 """Backward Euler: each step minimises the incremental potential ½ Σ m/Δt² |x - x̂|² + PE(x), x̂ = x + Δt v."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from pbng.equilibrium import ContactReport, Toucher
 from pbng.errors import InputError
 from pbng.problem import Problem
 from pbng.solvers.base import Budget, Monitor, Result, Solver, Status
 from pbng.solvers.loop import run
 
-WORST = (Status.CONVERGED, Status.PRECISION, Status.ITERATIONS, Status.SECONDS, Status.INTERRUPTED, Status.DIVERGED)
+WORST = (
+    Status.CONVERGED, Status.PRECISION, Status.ITERATIONS, Status.SECONDS, Status.CONTACTS, Status.INTERRUPTED,
+    Status.DIVERGED,
+)  # fmt: skip
 
 
 def steps_of(fps: float, dt: float | None, substeps: int | None) -> int:
@@ -52,20 +57,33 @@ class BackwardEuler:
         solver: What solves each step.
         dt: Time step [s].
         x, v: The state at time 0; prescribed vertices are put in place.
+        later: Makes the problem that holds from a time on, where vertices are let go: ``later(at=t)``.
 
     Raises:
         InputError: dt is not positive, or a free vertex has no mass.
     """
 
-    def __init__(self, problem: Problem, solver: Solver, dt: float, x: np.ndarray, v: np.ndarray) -> None:
-        self.problem, self.dt, self.step_number = problem, dt, 0
-        self.free = np.flatnonzero(~problem.fixed)
-        self.method = solver.set_up(problem.dynamic(dt))
+    def __init__(
+        self,
+        problem: Problem,
+        solver: Solver,
+        dt: float,
+        x: np.ndarray,
+        v: np.ndarray,
+        later: Callable[..., Problem] | None = None,
+    ) -> None:
+        self.solver, self.dt, self.later, self.step_number = solver, dt, later, 0
+        self._take(problem)
         self.x, self.v = problem.constrain(x, 0.0), v
         held = problem.fixed
         if held.any():  # they have the velocity of their motion, not the one that was given
             self.v = np.array(v)
             self.v[held] = (problem.prescribed(dt) - problem.prescribed(0.0)) / dt
+
+    def _take(self, problem: Problem) -> None:
+        self.problem, self.free = problem, np.flatnonzero(~problem.fixed)
+        self.method = self.solver.set_up(problem.dynamic(self.dt))
+        self.toucher = Toucher(problem, self.method) if problem.contact else None
 
     @property
     def t(self) -> float:
@@ -77,6 +95,8 @@ class BackwardEuler:
 
     def step(self, budget: Budget, monitor: Monitor | None = None) -> Result:
         """Take one step; a result that is not finite or was interrupted leaves the state as it was."""
+        if self.later is not None and self.t >= self.problem.until - 1e-6 * self.dt:
+            self._take(self.later(at=self.t + 1e-6 * self.dt))
         ahead = self.x + self.dt * self.v
         self.step_number += 1
         result = self._run(self.problem.constrain(ahead, self.t), ahead, budget, monitor)
@@ -90,6 +110,8 @@ class BackwardEuler:
     def advance(self, steps: int, budget: Budget, monitor: Monitor | None = None) -> Result:
         """Take some steps: the last one's result, with the iterations and seconds of all and the worst status."""
         results: list[Result] = []
+        if self.toucher:
+            self.toucher.began()
         for _ in range(steps):
             results.append(self.step(budget, monitor))
             if not results[-1].status.ok:
@@ -102,6 +124,13 @@ class BackwardEuler:
             monitor_seconds=sum(r.monitor_seconds for r in results),
         )
 
+    def report(self) -> ContactReport | None:
+        """What touched in the steps since the last :meth:`advance` began."""
+        return self.toucher.report(self.x) if self.toucher else None
+
     def _run(self, x: np.ndarray, ahead: np.ndarray, budget: Budget, monitor: Monitor | None) -> Result:
         targets = np.concatenate([self.problem.targets(self.t), ahead[self.free]])
-        return run(self.method, x, budget, monitor, targets=targets)
+        if self.toucher is None:
+            return run(self.method, x, budget, monitor, targets=targets)
+        contacts = self.toucher.find(self.x, x, max(self.t - self.dt, 0.0), self.t, limited=True)
+        return run(self.method, contacts.put_outside(x), budget, monitor, targets=targets, contacts=contacts)

@@ -1,5 +1,6 @@
 """The discrete problem: frozen arrays, and its energy and forces in float64 (Eqs. 11-17)."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,9 +11,11 @@ import numpy as np
 from pbng.assembly import ElementBlocks
 from pbng.coloring import color_nodes, morton
 from pbng.constraints import WeakConstraints, WeakEnergy
+from pbng.contact.spec import ContactSpec
 from pbng.elements.base import ElementKind, Term
 from pbng.errors import InputError
 from pbng.materials.base import Block, Material, model_of
+from pbng.materials.bending import Bending
 from pbng.mesh import Mesh
 from pbng.topology import components, incidence
 
@@ -22,7 +25,7 @@ class ElementGroup:
     """Elements of one kind and one material; ``cells`` (n_elem, corners) int32 are numbered through all bodies."""
 
     kind: ElementKind
-    material: Material
+    material: Material | Bending
     cells: np.ndarray
 
     @cached_property
@@ -86,6 +89,8 @@ class Problem:
         end: Time [s] at which every motion has ended.
         weak: Weak constraints, by size of their stencils.
         dt: Time step [s] of a problem of backward Euler (:meth:`dynamic`), else None.
+        contact: What may touch, if anything may; where it does is no part of the problem.
+        until: Time [s] at which some vertices are let go, and the scene compiles to another problem.
 
     What evaluates something takes ``targets`` (n_target, 3) [m], the points in space that weak constraints end at,
     by default those at the end of every motion.
@@ -102,6 +107,8 @@ class Problem:
     end: float = 0.0
     weak: tuple[WeakConstraints, ...] = ()
     dt: float | None = None
+    contact: ContactSpec | None = None
+    until: float = math.inf
 
     @property
     def n_vert(self) -> int:

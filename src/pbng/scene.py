@@ -10,10 +10,15 @@ import numpy as np
 
 from pbng.bindings import Binding, bind, weak_constraints
 from pbng.bodies import Body, Points, Selection
+from pbng.contact.collider import Collider
+from pbng.contact.surfaces import ContactRule, contact_spec, has_surface
 from pbng.elements.base import ElementKind
+from pbng.elements.hinge import HINGES
+from pbng.elements.membrane import MEMBRANE
 from pbng.elements.simplex import PLANE_TRIANGLE, TET
 from pbng.errors import InputError
 from pbng.materials.base import Material
+from pbng.materials.bending import Bending
 from pbng.mesh import Mesh, TetMesh, TriMesh, triangle_areas
 from pbng.motions import Motion, as_motion
 from pbng.problem import BodyRange, ElementGroup, Problem
@@ -23,12 +28,13 @@ log = logging.getLogger("pbng")
 
 @dataclass(frozen=True, eq=False)
 class _Move:
-    """Prescribed vertices, by index in the scene; a pin has no motion."""
+    """Prescribed vertices, by index in the scene, until a time; a pin has no motion."""
 
     index: np.ndarray
     motion: Motion | None
     start: float
     over: float
+    until: float = math.inf
 
 
 class Scene:
@@ -46,40 +52,51 @@ class Scene:
         self._moves: list[_Move] = []
         self._forces: list[tuple[np.ndarray, np.ndarray]] = []
         self._bindings: list[Binding] = []
+        self._contact: ContactRule | None = None
+        self.colliders: list[Collider] = []
 
     def add(
-        self, mesh: Mesh, material: Material | Mapping[str, Material], name: str | None = None, at: Any = None
+        self,
+        mesh: Mesh,
+        material: Material | Mapping[str, Material],
+        bending: Bending | None = None,
+        name: str | None = None,
+        at: Any = None,
     ) -> Body:
         """Add a body.
 
         Args:
             mesh: Its rest state.
-            material: One material, or one for each of the mesh's cell groups, which must cover every cell once.
+            material: One material, or one for each of the mesh's cell groups, which must cover every cell once. With
+                :class:`pbng.Membrane` triangles are cloth, with a material of solids they are plane strain.
+            bending: How cloth resists bending; by default not at all.
             name: Unique; by default numbered.
             at: Translation [m] of the mesh, (3,).
 
         Raises:
-            InputError: The name is taken, groups are unknown, overlap or leave cells out, or triangles are not plane.
+            InputError: The name is taken, groups are unknown, overlap or leave cells out, triangles of a solid are not
+                plane, or cloth has an edge of more than two triangles or neighbours that are not oriented alike.
         """
         name = f"body{len(self.bodies)}" if name is None else name
         if name in (b.name for b in self.bodies):
             raise InputError(f"the scene already has a body named {name!r}")
         if not isinstance(mesh, Mesh):
             raise InputError(f"body {name!r}: expected a TetMesh or TriMesh, not {type(mesh).__name__}")
-        if isinstance(mesh, TriMesh) and not mesh.is_plane:
-            raise InputError(f"body {name!r}: a solid in two dimensions must lie in a plane of constant z")
         if at is not None:
             mesh = _translated(mesh, np.array(_vector(f"body {name!r}: at", at)))
         start = sum(b.mesh.n_vert for b in self.bodies)
-        body = Body(name, mesh, _materials(name, mesh, material), start)
+        body = Body(name, mesh, _materials(name, mesh, material), start, bending)
         self.bodies.append(body)
         return body
 
-    def pin(self, selection: Selection) -> None:
-        """Hold vertices where they are at rest."""
-        self._moves.append(_Move(self._checked("pin", selection), None, 0.0, 0.0))
+    def pin(self, selection: Selection, until: float = math.inf) -> None:
+        """Hold vertices where they are at rest, until a time [s] at which they are let go."""
+        _check_until("pin", until)
+        self._moves.append(_Move(self._checked("pin", selection), None, 0.0, 0.0, until))
 
-    def move(self, selection: Selection, motion: Any, over: float = 0.0, start: float = 0.0) -> None:
+    def move(
+        self, selection: Selection, motion: Any, over: float = 0.0, start: float = 0.0, until: float = math.inf
+    ) -> None:
         """Prescribe the motion of vertices.
 
         Moves of the same vertices follow upon each other: each starts from where the one before has left them.
@@ -89,13 +106,15 @@ class Scene:
             motion: A :class:`pbng.Motion`, or a function ``(t, X) -> x``. Rotations and scalings act about the
                 selection's centroid unless they name a center.
             over: Seconds [s] in which it is carried out at a steady rate; 0 at once.
-            start: Time [s] at which it begins.
+            start: Time [s] at which it begins; until then the vertices are held.
+            until: Time [s] at which the vertices are let go; by default they stay where the motion has ended.
 
         Raises:
             InputError: The selection is empty, or shares only some vertices with that of an earlier pin or move.
         """
         _check_times("move", over, start)
-        self._moves.append(_Move(self._checked("move", selection), as_motion(motion), start, over))
+        _check_until("move", until)
+        self._moves.append(_Move(self._checked("move", selection), as_motion(motion), start, over, until))
 
     def force(self, selection: Selection, force: Sequence[float]) -> None:
         """Spread a total force [N] evenly over vertices."""
@@ -163,6 +182,65 @@ class Scene:
         weak_constraints([binding])  # says what is wrong with it here, and not when the scene compiles
         self._bindings.append(binding)
 
+    def collide_with(self, colliders: Collider | Sequence[Collider]) -> None:
+        """Keep the surfaces of all bodies, and cloth, out of kinematic bodies (section 7.2).
+
+        Args:
+            colliders: :class:`pbng.Plane`, :class:`pbng.Sphere`, :class:`pbng.Capsule`, :class:`pbng.Box`,
+                :class:`pbng.Kinematic`, or several.
+        """
+        several = [colliders] if isinstance(colliders, Collider) else list(colliders)
+        for c in several:
+            if not isinstance(c, Collider):
+                raise InputError(f"collide_with: expected a collider such as Plane or Kinematic, not {c!r:.80}")
+        self.colliders += several
+
+    def contact(
+        self,
+        *bodies: Body,
+        k_n: float | None = None,
+        k_tau: float = 0.0,
+        radius: float | None = None,
+        thickness: float | None = None,
+        self_collision: bool | Sequence[Body] = False,
+        rings: int = 2,
+    ) -> None:
+        """Let bodies, solids and cloth, collide with each other.
+
+        Contacts are one-sided springs between points and triangles and between edges, found anew at each step.
+
+        Args:
+            bodies: Which; by default all that the scene has when it compiles.
+            k_n: Stiffness along the normal [N/m]; by default ten times the E h of the softer body.
+            k_tau: Stiffness across it [N/m]: 0 slides, more holds on like friction while there is contact.
+            radius: Distance [m] below which surfaces count as close; by default half the mean length of their edges.
+            thickness: Distance [m] that is kept; by default none between solids, and for cloth that of its material or
+                a fifth of the mean length of its edges.
+            self_collision: Whether bodies collide with themselves, or which do.
+            rings: Rings of triangles around a vertex with which it does not collide.
+
+        Raises:
+            InputError: It was called before, a number is negative or k_n zero, or a body belongs to another scene.
+        """
+        if self._contact is not None:
+            raise InputError("contact: called twice; one rule holds for the scene")
+        for name, value in (("k_n", k_n), ("radius", radius)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise InputError(f"contact: {name} must be positive and finite, not {value}")
+        for name, value in (("k_tau", k_tau), ("thickness", thickness)):
+            if value is not None and not (math.isfinite(value) and value >= 0):
+                raise InputError(f"contact: {name} must be finite and not negative, not {value}")
+        if not (isinstance(rings, int) and rings >= 1):
+            raise InputError(f"contact: rings must be a whole number of at least 1, not {rings}")
+        own = self_collision if isinstance(self_collision, bool) else tuple(self_collision)
+        for b in (*bodies, *(own if isinstance(own, tuple) else ())):
+            if not isinstance(b, Body):
+                raise InputError(f"contact: expected bodies, not {type(b).__name__}")
+            self._check_body("contact", b)
+            if not has_surface(b):
+                raise InputError(f"contact: body {b.name!r} has no surface: it is plane")
+        self._contact = ContactRule(bodies, own, k_n, k_tau, radius, thickness, rings)
+
     def _checked_points(self, what: str, points: Any) -> Points:
         if isinstance(points, Points):
             self._check_body(what, points.body)
@@ -186,8 +264,12 @@ class Scene:
         if not any(b is body for b in self.bodies):
             raise InputError(f"{what}: body {body.name!r} belongs to another scene")
 
-    def compile(self, free: bool = False) -> Problem:
-        """The discrete problem of this scene as it now stands; ``free`` allows that nothing holds a body.
+    def compile(self, free: bool = False, at: float = 0.0) -> Problem:
+        """The discrete problem of this scene as it now stands.
+
+        Args:
+            free: Whether nothing need hold a body.
+            at: Time [s] at which it holds: pins and moves that have ended are left out.
 
         Raises:
             InputError: There is no body, nothing is held, or selections of moves overlap in part.
@@ -195,26 +277,29 @@ class Scene:
         if not self.bodies:
             raise InputError("the scene has no body")
         X = np.concatenate([b.mesh.X for b in self.bodies])
-        groups: dict[tuple[ElementKind, Material], list[np.ndarray]] = {}
+        groups: dict[tuple[ElementKind, Material | Bending], list[np.ndarray]] = {}
         mass = np.zeros(len(X))
         for b in self.bodies:
-            kind = TET if isinstance(b.mesh, TetMesh) else PLANE_TRIANGLE
+            kind = TET if isinstance(b.mesh, TetMesh) else MEMBRANE if b.is_cloth else PLANE_TRIANGLE
             for material, cells in b.materials:
                 global_cells = (b.mesh.cells[cells] + b.start).astype(np.int32)
                 groups.setdefault((kind, material), []).append(global_cells)
                 weight = material.density * b.mesh.volume[cells] / kind.corners
                 mass += np.bincount(global_cells.ravel(), np.repeat(weight, kind.corners), len(X))
+            if b.bending is not None and b.bending.k > 0 and isinstance(b.mesh, TriMesh) and len(b.mesh.hinges):
+                hinge = HINGES[b.bending.weighted, b.bending.rest == "mesh"]
+                groups.setdefault((hinge, b.bending), []).append((b.mesh.hinges + b.start).astype(np.int32))
         f_ext = np.outer(mass, self.gravity)
         for index, force in self._forces:
             np.add.at(f_ext, index, force)
         for b in self.bodies:
-            if isinstance(b.mesh, TriMesh):
+            if isinstance(b.mesh, TriMesh) and not b.is_cloth:
                 f_ext[b.start : b.start + b.mesh.n_vert, 2] = 0  # plane strain: z never moves
-        prescribed = _Prescribed(X, self._moves)
+        prescribed = _Prescribed(X, [m for m in self._moves if m.until > at])
         fixed = np.zeros(len(X), bool)
         fixed[prescribed.index] = True
         weak = weak_constraints(self._bindings)
-        if not (free or fixed.any() or any(w.anchored for w in weak)):
+        if not (free or self.colliders or fixed.any() or any(w.anchored for w in weak)):
             raise InputError("no vertex is pinned or moved: the equilibrium is not unique; pin a part of each body")
         problem = Problem(
             name=self.name,
@@ -225,8 +310,10 @@ class Scene:
             prescribed=prescribed,
             f_ext=f_ext,
             mass=mass,
-            end=max([prescribed.end, *(b.targets.end for b in self._bindings if isinstance(b.targets, _Prescribed))]),
+            end=max([prescribed.end, *(c.end for c in self.colliders), *(b.targets.end for b in self._bindings if isinstance(b.targets, _Prescribed))]),
             weak=weak,
+            contact=contact_spec(self.bodies, self._contact, self.colliders),
+            until=min((m.until for m in self._moves if m.until > at), default=math.inf),
         )
         if not free:
             self._warn_of_loose_parts(problem)
@@ -315,6 +402,11 @@ def _translated(mesh: Mesh, by: np.ndarray) -> Mesh:
 def _check_times(what: str, over: float, start: float) -> None:
     if not (math.isfinite(over) and over >= 0 and math.isfinite(start) and start >= 0):
         raise InputError(f"{what}: over and start must be finite and not negative, not {over} and {start}")
+
+
+def _check_until(what: str, until: float) -> None:
+    if not until > 0:
+        raise InputError(f"{what}: until must be positive, not {until}")
 
 
 def _vector(what: str, values: Any) -> tuple[float, ...]:

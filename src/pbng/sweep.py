@@ -63,7 +63,7 @@ def make_sweep(key: str, dtype: np.dtype):
         idx, coef, nodal = array(arguments, 3, np.uint32), array(arguments, 4, real), array(arguments, 5, real)
         par, omega = array(arguments, 6, real), array(arguments, 7, real)[0]
         acc = scratch(size, real)
-        g = _aligned(np.empty(12 * W * AHEAD + W, real))  # on the stack too it is a tenth slower, for corotated
+        g = aligned_part(np.empty(12 * W * AHEAD + W, real))  # on the stack too it is a tenth slower, for corotated
         for b in range(low, high):
             _load(uint64(b), x, nodal, acc)
             for s in range(seg_start[b], seg_start[b + 1]):
@@ -75,7 +75,7 @@ def make_sweep(key: str, dtype: np.dtype):
 
 
 @inline
-def _aligned(a):
+def aligned_part(a):
     """The part of a that begins at a cache line."""
     return a[(64 - a.ctypes.data % 64) % 64 // a.itemsize :]
 

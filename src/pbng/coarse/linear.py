@@ -27,30 +27,34 @@ class BlockMatrix:
     Args:
         node: Nodes of the pieces, (n_piece, 8).
         n_node: Number of nodes.
-        constant: What is always added, in blocks of 3x3, (3 n_node, 3 n_node).
     """
 
-    def __init__(self, node: np.ndarray, n_node: int, constant: scipy.sparse.bsr_matrix | None = None) -> None:
+    def __init__(self, node: np.ndarray, n_node: int) -> None:
+        self.n_node = n_node
         key = (node[:, :, None].astype(np.int64) * n_node + node[:, None, :]).ravel()
         order = np.argsort(key, kind="stable")
-        key = key[order]
-        present = key[np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))]
-        if constant is not None:
-            row = np.repeat(np.arange(n_node), np.diff(constant.indptr))
-            more = row * n_node + constant.indices
-            present = np.union1d(present, more)
+        self.key = key[order]
+        self.own = self.key[np.flatnonzero(np.concatenate([[True], self.key[1:] != self.key[:-1]]))]
         piece, a, b = order // 64, order // 8 % 8, order % 8
         self.source = 576 * piece + 24 * a + b  # where a block's first entry is in the stiffness
-        self.source_start = np.append(np.searchsorted(key, present), len(key))
-        self.column = (present % n_node).astype(np.int32)
-        self.start = np.searchsorted(present // n_node, np.arange(n_node + 1))
-        self.diagonal = np.flatnonzero(present // n_node == self.column)
+        self.inverse = np.empty((n_node, 9))
+        self.add(None)
+
+    def add(self, constant: scipy.sparse.bsr_matrix | None) -> None:
+        """What is added to the stiffness from now on, in blocks of 3x3, (3 n_node, 3 n_node)."""
+        n, present = self.n_node, self.own
+        if constant is not None:
+            more = np.repeat(np.arange(n), np.diff(constant.indptr)) * n + constant.indices
+            present = np.union1d(present, more)
+        self.source_start = np.append(np.searchsorted(self.key, present), len(self.key))
+        self.column = (present % n).astype(np.int32)
+        self.start = np.searchsorted(present // n, np.arange(n + 1))
+        self.diagonal = np.flatnonzero(present // n == self.column)
         self.value = np.empty((len(present), 9))
         self.constant = None
         if constant is not None:
             self.constant = np.zeros((len(present), 9))
             self.constant[np.searchsorted(present, more)] = constant.data.reshape(-1, 9)
-        self.inverse = np.empty((n_node, 9))
 
     def assemble(self, stiffness: np.ndarray, least: np.ndarray) -> None:
         """Sum stiffness (n_piece, 3, 8, 3, 8), with diagonal blocks no weaker than ``least`` (n_node,) [N/m]."""
@@ -75,19 +79,21 @@ class GridSolver:
 
     Args:
         grids: From fine to coarse, at least one.
-        hessian: What is added on the finest grid, constant, in blocks of 3x3.
     """
 
-    def __init__(self, grids: list[Grid], hessian: scipy.sparse.bsr_matrix | None = None) -> None:
+    def __init__(self, grids: list[Grid]) -> None:
         self.up = [interpolation(coarse) for coarse in grids[1:]]
-        self.matrices = []
-        for level, g in enumerate(grids):
-            self.matrices.append(BlockMatrix(g.node, g.n_node, hessian))
+        self.matrices = [BlockMatrix(g.node, g.n_node) for g in grids]
+        self.down = [u.T.tocsr() for u in self.up]
+        self.split = np.cumsum([len(g.node) for g in grids])[:-1]
+
+    def add(self, hessian: scipy.sparse.bsr_matrix | None) -> None:
+        """What is added on the finest grid from now on, in blocks of 3x3; restricted to the others."""
+        for level, matrix in enumerate(self.matrices):
+            matrix.add(hessian)
             if hessian is not None and level < len(self.up):
                 up = scipy.sparse.kron(self.up[level], np.eye(3), format="bsr")
                 hessian = (up.T @ hessian @ up).tobsr((3, 3))
-        self.down = [u.T.tocsr() for u in self.up]
-        self.split = np.cumsum([len(g.node) for g in grids])[:-1]
 
     @_blas.wrap(limits=1, user_api="blas")
     def factorise(self, stiffness: np.ndarray, least: list[np.ndarray]) -> None:

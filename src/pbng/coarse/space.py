@@ -1,5 +1,9 @@
-"""The coarse space of a problem: trilinear displacements of the free vertices on grids of cells four elements wide."""
+"""The coarse space of a problem: trilinear displacements of the free vertices on grids of cells four elements wide.
 
+It moves solids only; vertices of cloth have no weight in it and are left to the sweeps.
+"""
+
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -10,14 +14,43 @@ from numba import uint64
 from pbng.coarse.grid import CORNERS, Grid, coarser, make_grid
 from pbng.coarse.linear import DENSE, GridSolver, interpolation, weight_matrix
 from pbng.coarse.stiffness import Cubature
+from pbng.contact.contacts import ContactEnergy
 from pbng.packing import Packed
 from pbng.parallel import array, body, each, rows
-from pbng.problem import Problem
+from pbng.problem import ElementGroup, Problem
 
 WIDTH = 4  # edge of a cell in mean distances of vertices
 LEAST = 2e-3  # of the stiffness of the vertices that a node moves: a node that the cubature missed is no weaker
+WALL = 10.0  # stiffness of what keeps a vertex out of a collider, relative to the vertex's own
 TIE = 100.0  # stiffness of the ties of the extension, relative to its Laplacian
 EXTENSION = 6000  # nodes of the finest grid on which constraints are extended
+
+
+def coarse_space(problem: Problem, packed: Packed) -> "CoarseSpace | EmptySpace":
+    """The coarse space of a problem, empty if it has no solid."""
+    return CoarseSpace(problem, packed) if _solids(problem) else EmptySpace(problem)
+
+
+class EmptySpace:
+    """What stands in for a coarse space where there is none: nothing is corrected."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.n_vert = problem.n_vert
+
+    def touch(self, touching: ContactEnergy | None, x: np.ndarray, slack: float) -> None:
+        """As :meth:`CoarseSpace.touch`."""
+
+    def refresh(self, x: np.ndarray) -> None:
+        """As :meth:`CoarseSpace.refresh`."""
+
+    def direction(self, f: np.ndarray, d: np.ndarray, tolerance: float) -> float:
+        """As :meth:`CoarseSpace.direction`; d = 0."""
+        d[:] = 0.0
+        return 0.0
+
+    def extend(self, increment: np.ndarray) -> np.ndarray:
+        """As :meth:`CoarseSpace.extend`; zero."""
+        return np.zeros((self.n_vert, 3))
 
 
 class CoarseSpace:
@@ -33,15 +66,20 @@ class CoarseSpace:
         self.grids, pieces = _grids(problem)
         self.cubature = Cubature(problem, self.grids, pieces, packed.slot)
         free = np.flatnonzero(~problem.fixed)
-        self.solver = GridSolver(self.grids, self._weak_hessian())
+        self.solver = GridSolver(self.grids)
+        self.tied = self._weak_hessian()
+        if self.tied is not None:
+            self.solver.add(self.tied)
         n, place = packed.n_free // 4, packed.slot[free]
         self.parents, self.weights = np.zeros((n, 8), np.int32), np.zeros((n, 8))  # U, in the order of the blocks
         self.parents[place], self.weights[place] = self.grids[0].parents[free], self.grids[0].weights[free]
         up = weight_matrix(self.parents, self.weights, self.grids[0].n_node)
+        self.up, self.touched = up, b""
+        self.bearing = WALL * packed.stiffness
         down = up.T.tocsr()
         self.restriction = down.indptr.astype(np.int64), down.indices.astype(np.int32), down.data
         self.least = self._least(up, packed.stiffness)
-        plane = np.array([b.mesh.cells.shape[1] == 3 for b in problem.bodies])
+        plane = np.array([b.mesh.cells.shape[1] == 3 for b in problem.bodies])  # cloth has no nodes
         self.moves_z = ~plane[self.grids[0].body]
 
     def _weak_hessian(self) -> scipy.sparse.bsr_matrix | None:
@@ -60,6 +98,19 @@ class CoarseSpace:
             if level < len(self.grids) - 1:
                 up = up @ self.solver.up[level]
         return least
+
+    def touch(self, touching: ContactEnergy | None, x: np.ndarray, slack: float) -> None:
+        """Take what resists at positions x (n, 3) of contacts and of half-spaces touched to within ``slack`` [m]."""
+        active = touching.active(x, slack) if touching else None
+        key = b"" if touching is None else touching.name + active.tobytes()
+        if key == self.touched:
+            return
+        self.touched = key
+        total = self.tied
+        if active is not None and active.any():
+            found = touching.hessian(active, self.bearing, self.up)
+            total = found if total is None else (total + found).tobsr((3, 3))
+        self.solver.add(total)
 
     def refresh(self, x: np.ndarray) -> None:
         """Take the stiffness at a flat position array."""
@@ -95,15 +146,22 @@ class CoarseSpace:
         return up, scipy.sparse.linalg.splu(tied.tocsc()), at_fixed * (TIE * scale)
 
 
+def _solids(problem: Problem) -> list[ElementGroup]:
+    return [g for g in problem.groups if g.kind.solid]
+
+
 def _grids(problem: Problem) -> tuple[list[Grid], list[np.ndarray]]:
-    """Grids from fine to coarse, and for each the piece of every element, in the order of the problem's groups."""
-    corners = max(g.cells.shape[1] for g in problem.groups)
-    cells = [
-        np.concatenate([c, np.repeat(c[:, :1], corners - c.shape[1], 1)], 1) for c in (g.cells for g in problem.groups)
-    ]
+    """Grids from fine to coarse, and for each the piece of every element, in the order of the groups of solids."""
+    groups = _solids(problem)
+    corners = max(g.cells.shape[1] for g in groups)
+    cells = [np.concatenate([c, np.repeat(c[:, :1], corners - c.shape[1], 1)], 1) for c in (g.cells for g in groups)]
     body = np.repeat(np.arange(len(problem.bodies)), [b.stop - b.start for b in problem.bodies])
     low, size = _cells(problem)
-    grids = [make_grid(problem.X, np.concatenate(cells), body, low, size)]
+    grid = make_grid(problem.X, np.concatenate(cells), body, low, size)
+    covered = np.zeros((problem.n_vert, 1))
+    for c in cells:
+        covered[c] = 1.0
+    grids = [replace(grid, weights=grid.weights * covered)]
     pieces = [grids[0].piece]
     while 3 * grids[-1].n_node > DENSE:
         grid = coarser(grids[-1], low, size)

@@ -6,6 +6,7 @@ like one finite element with eight nodes. Constrained vertices follow nothing.
 """
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -14,9 +15,10 @@ from numba import uint64
 
 from pbng.coarse.grid import Grid, trilinear
 from pbng.jit import inline, serial
+from pbng.materials.base import Material
 from pbng.materials.hessian import hessians
 from pbng.parallel import array, body, each, rows
-from pbng.problem import Problem
+from pbng.problem import ElementGroup, Problem
 
 SAMPLES = 8  # elements drawn in each piece from each stratum; 4 are too few
 FLOOR = 0.01  # of μ: lowest eigenvalue of a Hessian
@@ -30,13 +32,13 @@ class Cubature:
 
     Args:
         problem: What is solved.
-        grids: Grids over it; their pieces are numbered through.
-        pieces: For each grid the piece of each element of the problem, in the order of ``problem.groups``.
+        grids: Grids over its solids; their pieces are numbered through.
+        pieces: For each grid the piece of each element of a solid, in the order of ``problem.groups``.
         slot: Place of each vertex in position arrays.
     """
 
     def __init__(self, problem: Problem, grids: list[Grid], pieces: list[np.ndarray], slot: np.ndarray) -> None:
-        groups = problem.groups
+        groups = [g for g in problem.groups if g.kind.solid]
         group = np.repeat(np.arange(len(groups)), [len(g.cells) for g in groups])
         volume = np.concatenate([g.kind.volume(problem.X[g.cells]) for g in groups])
         held = np.concatenate([problem.fixed[g.cells].any(1) for g in groups])
@@ -52,7 +54,7 @@ class Cubature:
             owner.append(piece[e[order]] + first)
             first += len(grid.node)
         e, where = np.concatenate(chosen), np.concatenate(owner)
-        cells, gradients = _corners(problem, group, e)
+        cells, gradients = _corners(problem.X, groups, group, e)
         origin, size = (
             np.concatenate([getattr(g, name) for g in grids])[where][:, None] for name in ("origin", "size")
         )
@@ -65,7 +67,7 @@ class Cubature:
             table = np.zeros((len(groups), model.n_parameters))
             table[list(numbers)] = list(numbers.values())
             self.terms.append((model, mine, table[group[e[mine]]]))
-        self.floor = FLOOR * np.array([g.material.mu for g in groups])[group[e]]
+        self.floor = FLOOR * np.array([g.material.mu for g in groups if isinstance(g.material, Material)])[group[e]]
         self.place = (4 * slot[cells]).astype(np.int64)
         self.gradients = gradients.reshape(-1, 3 * CORNERS)
         self.coarse = np.einsum("nak,nai->nik", follow, gradients).reshape(-1, 24)
@@ -87,15 +89,17 @@ class Cubature:
         return self.stiffness
 
 
-def _corners(problem: Problem, group: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _corners(
+    X: np.ndarray, groups: Sequence[ElementGroup], group: np.ndarray, e: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, CORNERS) of the elements e and gradients (n, CORNERS, 3) of their shape functions."""
     cells, gradients = np.zeros((len(e), CORNERS), np.int64), np.zeros((len(e), CORNERS, 3))
     start = 0
-    for n, g in enumerate(problem.groups):
+    for n, g in enumerate(groups):
         mine = np.flatnonzero(group[e] == n)
         corners = g.cells[e[mine] - start]
         cells[mine[:, None], np.arange(g.kind.corners)] = corners
-        gradients[mine, : g.kind.corners] = g.kind.gradients(problem.X[corners])
+        gradients[mine, : g.kind.corners] = g.kind.gradients(X[corners])
         start += len(g.cells)
     return cells, gradients
 

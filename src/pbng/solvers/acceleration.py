@@ -31,6 +31,9 @@ class FixedPoint(Protocol):
     def energy(self, x: np.ndarray) -> float:
         """Potential energy [J] in float64."""
 
+    def admit(self, x: np.ndarray, g: np.ndarray) -> None:
+        """Move x out of colliders, and onto them where g touches them: only sweeps let go of what touches."""
+
     def rises(self, energy: float, before: float, x: np.ndarray) -> bool:
         """Whether an energy is above an earlier one, that of x, by more than rounding may explain."""
 
@@ -124,9 +127,11 @@ class _TwoStep:
         here = x[:n].copy()
         before = here if self.before is None else self.before
         self.map.apply(x)
+        g = x.copy()
         self.l += 1
         omega, gamma = real(self.omega(self.l)), real(self.gamma)
         x[:n] = omega * (gamma * (x[:n] - here) + here - before) + before
+        self.map.admit(x, g)
         self.before = here
 
     def settle(self, x: np.ndarray) -> None:
@@ -176,6 +181,7 @@ class _Mixing:
         self.map.apply(g, self.softness.omega)
         if self.history.push(x[:n], g[:n]):
             if self.history.mix(g[:n], mixed[:n]):
+                self.map.admit(mixed, g)
                 if self._trusted():
                     x[:] = mixed
                     self.unchecked += 1

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from pbng.contact.contacts import Contacts
 from pbng.errors import InputError
 from pbng.problem import Problem
 
@@ -74,6 +75,7 @@ class Status(enum.Enum):
     ITERATIONS = "The iterations of the budget were used up."
     SECONDS = "The time of the budget was used up."
     PRECISION = "The residual reached the floor that rounding the positions leaves; float64 goes below that of float32."
+    CONTACTS = "Each round of contacts changed the equilibrium; the last state is that of the last round."
     DIVERGED = "The state is not finite."
     INTERRUPTED = "Interrupted; the state is the last one computed."
 
@@ -189,10 +191,18 @@ class Method(Protocol):
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
         """A better state to start from than x (n_vert, 3), which is ``before`` with prescribed vertices moved."""
 
-    def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
+    def start(
+        self,
+        x: np.ndarray,
+        targets: np.ndarray | None = None,
+        contacts: Contacts | None = None,
+        resume: bool = False,
+    ) -> None:
         """Take x (n_vert, 3) as the state, with the prescribed vertices where they belong.
 
-        ``targets`` (n_target, 3) are those of the problem's weak constraints, by default at the end of every motion.
+        ``targets`` (n_target, 3) are those of the problem's weak constraints, by default at the end of every motion;
+        ``contacts`` are what touches, by default nothing. No vertex may lie outside their half-spaces.
+        With ``resume`` x is where the method is, and it keeps its precision.
         """
 
     def step(self) -> None:

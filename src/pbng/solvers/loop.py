@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 
+from pbng.contact.contacts import Contacts
 from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.solvers.base import Budget, History, Method, Monitor, Progress, Result, Status
@@ -19,18 +20,22 @@ def run(
     monitor: Monitor | None = None,
     before: np.ndarray | None = None,
     targets: np.ndarray | None = None,
+    contacts: Contacts | None = None,
+    resume: bool = False,
 ) -> Result:
     """Iterate from x (n_vert, 3), whose prescribed vertices are in place, until the budget says stop.
 
     The first residual is that of x. If ``before`` is x with the prescribed vertices where they were until now, the
     method may then begin at a better state, which it makes from the movement. The clock leaves out compilation. Ctrl-C
-    ends the loop with the last state computed. ``targets`` are those of the problem's weak constraints (n_target, 3).
+    ends the loop with the last state computed. ``targets`` are those of the problem's weak constraints (n_target, 3),
+    ``contacts`` what touches during the solve. With ``resume`` x is where the last solve ended, and the method goes on in
+    the precision that it had come to.
     """
     if budget.error is not None and not method.estimates_error:
         raise InputError(f"Budget(error={budget.error}): this method has no estimate of the error; use MultigridPBNG")
     every = budget.every or method.every
     clock, monitoring = _Clock(), _Clock(running=False)
-    method.start(x, targets)
+    method.start(x, targets, contacts, resume)
     history = History()
 
     def certify(iteration: int) -> None:
@@ -52,7 +57,8 @@ def run(
     iteration, correction = 0, 0.0
     seen = -1, x  # an iteration and the state after it
     if status is None and before is not None and (better := method.prepare(before, x)) is not None:
-        method.start(better, targets)
+        better = contacts.put_outside(better) if contacts is not None else better
+        method.start(better, targets, contacts)
         if refined:
             method.refine()
     try:

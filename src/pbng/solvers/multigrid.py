@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from pbng.coarse.space import CoarseSpace
+from pbng.coarse.space import coarse_space
 from pbng.errors import InputError
 from pbng.jit import compile_seconds
+from pbng.materials.base import Material
 from pbng.problem import Problem
 from pbng.solvers.acceleration import MixingHistory, Softness
 from pbng.solvers.base import Certificate, norm
@@ -36,7 +37,7 @@ COARSE_TOLERANCE = 0.1  # rougher solves save nothing and cost cycles below 1e-4
 
 @dataclass(frozen=True)
 class MultigridPBNG:
-    """PBNG with a coarse space: its number of cycles does not grow with the mesh. For solids.
+    """PBNG with a coarse space: its number of cycles does not grow with the mesh. For solids; cloth is only swept.
 
     Args:
         sweeps: Sweeps a cycle; by default 4, and 8 where a material is nearly incompressible (λ > 10 μ).
@@ -89,9 +90,9 @@ class TwoGrid(PackedMethod):
         self.cycle = solver
         start = time.perf_counter() - compile_seconds()
         with self.threads.used():
-            self.coarse = CoarseSpace(problem, self.packed)
+            self.coarse = coarse_space(problem, self.packed)
         self.setup_seconds += time.perf_counter() - compile_seconds() - start
-        stiff = any(g.material.lam > 10 * g.material.mu for g in problem.groups)
+        stiff = any(m.lam > 10 * m.mu for m in (g.material for g in problem.groups) if isinstance(m, Material))
         self.times = solver.sweeps or (8 if stiff else 4)
         self.d = np.zeros(self.n_free)
         stiffness = self.stiffness
@@ -105,13 +106,11 @@ class TwoGrid(PackedMethod):
         with self.threads.used():
             extended = x + self.coarse.extend(increment)
             extended[fixed] = x[fixed]
-            lower = self.energy(self.packed.pack(extended, self.targets)) < self.energy(
-                self.packed.pack(x, self.targets)
-            )
+            lower = self.energy(self.pack(extended)) < self.energy(self.pack(x))
         return extended if lower else None
 
     def begin(self, x: np.ndarray) -> None:
-        self.x = self.packed.pack(x, self.targets)
+        self.x = self.pack(x)
         self.g, self.z = self.x.copy(), self.x.copy()
         self.history = MixingHistory(self.cycle.memory) if self.cycle.memory else None
         self.E = self.energy(self.x)
@@ -138,11 +137,13 @@ class TwoGrid(PackedMethod):
         if not np.isfinite(f).all():
             self._tread_softly()
             return
+        self.coarse.touch(self.touching, self._places(g), self.slack(g))
         self.coarse.refresh(g)
         self.refreshed = True
         slope = self.coarse.direction(f, self.d, COARSE_TOLERANCE)
         tolerance = self.noise(self.x, self.E)
         np.add(g[:n], self.d, out=z[:n], casting="same_kind")
+        self.admit(z, g)
         self.Ez = self.energy(z)
         if self.Ez <= self.E - DECREASE * slope + tolerance:
             if self.softness.succeed() and self.history is not None:
@@ -160,6 +161,7 @@ class TwoGrid(PackedMethod):
                 return
             alpha *= SHRINK
             np.add(g[:n], alpha * self.d, out=z[:n], casting="same_kind")
+            self.admit(z, g)
         z[:], self.Ez = g, Eg
 
     def _tread_softly(self) -> None:
@@ -171,6 +173,7 @@ class TwoGrid(PackedMethod):
         """The next x from the last one and z."""
         n, m, history = self.n_free, self.g, self.history
         if history is not None and history.push(self.x[:n], self.z[:n]) and history.mix(self.z[:n], m[:n]):
+            self.admit(m, self.z)
             energy = self.energy(m)
             if energy <= self.Ez + self.noise(self.x, self.E):
                 self.x, self.g, self.E = m, self.x, energy

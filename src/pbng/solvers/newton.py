@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from pbng.contact.contacts import Contacts
 from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.problem import Problem
@@ -101,7 +102,13 @@ class NewtonMethod(VertexMethod):
         system = System(self.stiffness.matrix, self.stiffness.color_start, self.problem.X[self.vertex])
         self.linear = self.solver.linear.start(system)
 
-    def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
+    def start(
+        self,
+        x: np.ndarray,
+        targets: np.ndarray | None = None,
+        contacts: Contacts | None = None,
+        resume: bool = False,
+    ) -> None:
         super().start(x, targets)
         if x is not self.better:
             self._reset()

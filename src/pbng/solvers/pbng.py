@@ -9,6 +9,8 @@ import numpy as np
 
 from pbng.assembly import ElementBlocks
 from pbng.constraints import WeakEnergy
+from pbng.contact.contacts import ContactEnergy, Contacts
+from pbng.contact.nodes import ContactNodes
 from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.packing import Packed, pack_problem
@@ -105,6 +107,9 @@ class PackedMethod:
         self.load = float(np.linalg.norm(problem.f_ext, axis=1).sum())
         self.force_scale = 0.0  # of the last certificate [N]
         self.targets = self.ends = np.zeros((problem.n_target, 3))
+        self.contacts: Contacts | None = None
+        self.touching: ContactEnergy | None = None
+        self.contact_nodes: dict[str, ContactNodes] = {}
         self.x = self.packed.pack(problem.X, self.targets)
         self.iteration: Iteration | None = None
         self.known_energy, self.trust = math.inf, 0
@@ -113,12 +118,40 @@ class PackedMethod:
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
         return None
 
-    def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
+    def start(
+        self,
+        x: np.ndarray,
+        targets: np.ndarray | None = None,
+        contacts: Contacts | None = None,
+        resume: bool = False,
+    ) -> None:
         self.targets = self.problem.targets(self.problem.end) if targets is None else targets
         self.ends = self.targets - self.packed.origin  # relative to it, as positions are kept
+        self._touch(contacts if contacts is not None and len(contacts) else None)
         self.prescribed = np.array(x[self.problem.fixed], float)
-        self.packed = self.layout("float32" if self.solver.dtype == "auto" else self.solver.dtype)
+        if not resume:
+            self.packed = self.layout("float32" if self.solver.dtype == "auto" else self.solver.dtype)
         self.begin(x)
+
+    def _touch(self, contacts: Contacts | None) -> None:
+        """Take the contacts of a step."""
+        if contacts is self.contacts:
+            return
+        self.contacts, self.touching = contacts, None
+        if contacts is not None:
+            p = self.packed
+            self.touching = ContactEnergy(contacts, p.n_slot, p.slot, p.origin)
+            with self.threads.used():
+                for nodes in self.contact_nodes.values():
+                    nodes.update(contacts)
+
+    def _nodes_in_contact(self) -> ContactNodes:
+        """Their layout, in the present precision."""
+        name = self.packed.dtype.name
+        if name not in self.contact_nodes:
+            self.contact_nodes[name] = ContactNodes(self.problem, self.packed, self.problem.contact.surface)
+            self.contact_nodes[name].update(self.contacts)
+        return self.contact_nodes[name]
 
     def refine(self) -> bool:
         if self.solver.dtype != "auto" or self.packed.dtype == np.float64:
@@ -138,7 +171,7 @@ class PackedMethod:
 
     def begin(self, x: np.ndarray) -> None:
         """Take x (n_vert, 3) as the state, in the present precision, with no history."""
-        self.x = self.packed.pack(x, self.targets)
+        self.x = self.pack(x)
         self.known_energy = math.inf
         acceleration: Acceleration = self.solver.acceleration
         self.iteration = acceleration.start(self)
@@ -157,11 +190,30 @@ class PackedMethod:
         return self.packed.unpack(self.x)
 
     def apply(self, x: np.ndarray, omega: float = 1.0) -> None:
-        sweep(self.packed, x, self.colors, omega, self.times)
+        if self.contacts is None:
+            sweep(self.packed, x, self.colors, omega, self.times)
+            return
+        nodes = self._nodes_in_contact()
+        for _ in range(self.times):
+            sweep(nodes.others, x, self.colors, omega)
+            nodes.sweep(x, omega)
+
+    def admit(self, x: np.ndarray, g: np.ndarray) -> None:
+        if self.touching:
+            self.touching.put_outside(self._places(x), self.touching.held(self._places(g), self.slack(g)))
+
+    def pack(self, x: np.ndarray) -> np.ndarray:
+        """Positions (n_vert, 3) in the present precision, out of the colliders: rounding may have moved them in."""
+        packed = self.packed.pack(x, self.targets)
+        if self.touching:
+            self.touching.put_outside(self._places(packed))
+        return packed
 
     def energy(self, x: np.ndarray) -> float:
         energy = self.blocks.energy(x) - self._work(x)
-        return energy + self.weak.energy(self._places(x), self.ends) if self.weak else energy
+        if self.weak:
+            energy += self.weak.energy(self._places(x), self.ends)
+        return energy + self.touching.energy(self._places(x)) if self.touching else energy
 
     def certify(self) -> Certificate:
         with self.threads.used():
@@ -176,11 +228,25 @@ class PackedMethod:
             weak, scale = self.weak.forces(self._places(x), self.ends)
             self.forces.reshape(-1, 4)[:, :3] += weak
             force_scale += scale
-        return self.forces[: self.n_free] + self.f_ext[: self.n_free], force_scale, inverted
+        if self.touching:
+            pushed, scale = self.touching.forces(self._places(x))
+            self.forces.reshape(-1, 4)[:, :3] += pushed
+            force_scale += scale
+        f = self.forces[: self.n_free] + self.f_ext[: self.n_free]
+        if self.touching:
+            self.touching.balanced(self._places(f), self._places(x), self.slack(x))
+        return f, force_scale, inverted
+
+    def slack(self, x: np.ndarray) -> float:
+        """How far from a half-space a vertex may be that touches it [m]: roundings."""
+        return 4 * self.rounding(x)
 
     def floor(self, dtype: Any = None) -> float:
         """Norm of the forces that moving each node by half a unit in the last place of the largest position makes."""
-        return self.rounding(self.x, dtype) * float(np.linalg.norm(self.stiffness))
+        stiffness = self.stiffness
+        if self.touching:
+            stiffness = stiffness + self.touching.stiffness(self._places(self.x), len(stiffness))
+        return self.rounding(self.x, dtype) * float(np.linalg.norm(stiffness))
 
     def noise(self, x: np.ndarray, energy: float) -> float:
         """What rounding may do to an energy [J] at x."""

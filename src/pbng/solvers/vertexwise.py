@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from pbng.contact.contacts import Contacts
+from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.problem import Problem
 from pbng.solvers.base import Certificate, norm
@@ -20,12 +22,17 @@ class VertexMethod:
         problem: What is solved.
         threads: Threads; None for as many as prove fastest.
         set_up: What else to set up, timed.
+
+    Raises:
+        InputError: The problem has contact.
     """
 
     every = 1
     estimates_error = False
 
     def __init__(self, problem: Problem, threads: int | None = None, set_up: Callable[[], None] | None = None) -> None:
+        if problem.contact is not None:
+            raise InputError(f"scene {problem.name!r}: this method knows nothing of contact; use PBNG or MultigridPBNG")
         self.problem = problem
         self.threads = Threads(threads, FIRST_PROBE)
         self.free = np.flatnonzero(~problem.fixed)
@@ -41,7 +48,13 @@ class VertexMethod:
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
         return None
 
-    def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
+    def start(
+        self,
+        x: np.ndarray,
+        targets: np.ndarray | None = None,
+        contacts: Contacts | None = None,
+        resume: bool = False,
+    ) -> None:
         self.x = np.array(x, float)
         self.targets = self.problem.targets(self.problem.end) if targets is None else targets
 

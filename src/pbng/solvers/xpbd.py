@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from pbng.contact.contacts import Contacts
 from pbng.errors import InputError
 from pbng.packing import aligned, origin_of
 from pbng.problem import Problem
@@ -127,7 +128,13 @@ class ProjectionMethod(VertexMethod):
         rows[:, 3] = 0
         return out
 
-    def start(self, x: np.ndarray, targets: np.ndarray | None = None) -> None:
+    def start(
+        self,
+        x: np.ndarray,
+        targets: np.ndarray | None = None,
+        contacts: Contacts | None = None,
+        resume: bool = False,
+    ) -> None:
         super().start(x, targets)
         self.current = self.flat(x - self.origin if self.origin.any() else x)
         self.current.reshape(-1, 4)[self.place, 3] = self.inverse_mass

@@ -1,0 +1,1 @@
+"""Contact: trees, closest points, and the pairs that are found."""

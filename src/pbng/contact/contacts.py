@@ -1,0 +1,187 @@
+"""What touches during one step: contacts between surfaces, and half-spaces that colliders leave.
+
+A *contact* is a weak constraint between two interpolated points, one-sided: with C = Σ_j w_j x_j, weights of one side
+positive and of the other negative, and the gap g = n·C - offset, its energy is ½ k_n min(g, 0)². If it resisted when it
+was found it has ½ k_tau |C - n n·C|² too, for as long as it stands. A *half-space* is where one vertex has to stay: n·x
+>= offset, exactly.
+
+Stencils, normals and offsets are those of the start of the step: energies are convex in what a node sees of them.
+"""
+
+from dataclasses import dataclass, field
+from itertools import count
+
+import numpy as np
+import scipy.sparse
+
+from pbng.constraints import stencil_hessian
+
+CORNERS = 4  # vertices of a stencil: a vertex and a triangle, or two edges
+ROUNDS = 8  # of projections onto the half-spaces of one vertex
+_NAMES = count()
+
+
+def _none(*shape: int, dtype: type = float) -> np.ndarray:
+    return np.empty((0, *shape), dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Contacts (m) and half-spaces (k) of one step; by default none.
+
+    Attributes:
+        vertices: Vertices of each stencil, (m, 4) int32, none twice.
+        weights: Their weights, (m, 4), positive on the first side; each row sums to zero.
+        normal: Unit vectors from the second side to the first, (m, 3).
+        offset: What n·C must not be less than [m], (m,).
+        k_n: Stiffness [N/m], (m,).
+        k_tau: Tangential stiffness [N/m], (m,); zero where nothing resisted yet.
+        kept: Distance that is to be kept [m], (m,): the offset, unless that gives way for now.
+        vertex: Vertex of each half-space, (k,) int32.
+        plane: Its normal, (k, 3).
+        level: Its offset n·p of a point p on it [m], (k,).
+    """
+
+    vertices: np.ndarray = field(default_factory=lambda: _none(CORNERS, dtype=np.int32))
+    weights: np.ndarray = field(default_factory=lambda: _none(CORNERS))
+    normal: np.ndarray = field(default_factory=lambda: _none(3))
+    offset: np.ndarray = field(default_factory=_none)
+    k_n: np.ndarray = field(default_factory=_none)
+    k_tau: np.ndarray = field(default_factory=_none)
+    kept: np.ndarray = field(default_factory=_none)
+    vertex: np.ndarray = field(default_factory=lambda: _none(dtype=np.int32))
+    plane: np.ndarray = field(default_factory=lambda: _none(3))
+    level: np.ndarray = field(default_factory=_none)
+
+    def __len__(self) -> int:
+        return len(self.vertices) + len(self.vertex)
+
+    def clearance(self, x: np.ndarray) -> np.ndarray:
+        """How much farther apart each contact is at x (n_vert, 3) than it is to be kept [m], (m,)."""
+        C = np.einsum("mj,mji->mi", self.weights, x[self.vertices])
+        return (self.normal * C).sum(1) - self.kept
+
+    def put_outside(self, x: np.ndarray) -> np.ndarray:
+        """A copy of x (n_vert, 3) with every vertex in its half-spaces."""
+        x = np.array(x, float)
+        return _moved_in(x, self.vertex, self.plane, self.level)
+
+
+class ContactEnergy:
+    """Energy, forces and Hessian of contacts in float64, for any numbering of the vertices.
+
+    Args:
+        contacts: What touches.
+        n: Length of the position arrays.
+        slot: Number in them of each vertex.
+        origin: What positions are relative to [m], (3,).
+    """
+
+    def __init__(self, contacts: Contacts, n: int, slot: np.ndarray, origin: np.ndarray) -> None:
+        c, m = contacts, len(contacts.vertices)
+        self.name = next(_NAMES).to_bytes(8)  # tells one set of contacts from another
+        row = np.repeat(np.arange(m), CORNERS)
+        entries = c.weights.ravel(), (row, slot[c.vertices].ravel())
+        self.weights = scipy.sparse.csr_matrix(entries, (m, n))
+        self.spread = self.weights.T.tocsr()
+        self.reach = np.sqrt((c.weights**2).sum(1))  # norm of each contact's weights
+        self.normal, self.offset, self.k_n, self.k_tau = c.normal, c.offset, c.k_n, c.k_tau
+        self.sticks = bool(c.k_tau.any())
+        self.vertex, self.plane = slot[c.vertex], c.plane
+        self.level = c.level - c.plane @ origin
+
+    def energy(self, x: np.ndarray) -> float:
+        """Energy [J] at x (n, 3)."""
+        C, depth = self._gaps(x)
+        energy = 0.5 * float((self.k_n * depth * depth).sum())
+        if self.sticks:
+            energy += 0.5 * float((self.k_tau * (self._across(C) ** 2).sum(1)).sum())
+        return energy
+
+    def forces(self, x: np.ndarray) -> tuple[np.ndarray, float]:
+        """Forces (n, 3) [N], and the sum of the norms of all contacts' forces [N]."""
+        C, depth = self._gaps(x)
+        pull = (self.k_n * depth)[:, None] * self.normal
+        if self.sticks:
+            pull += self.k_tau[:, None] * self._across(C)
+        return -(self.spread @ pull), float((np.linalg.norm(pull, axis=1) * self.reach).sum())
+
+    def balanced(self, f: np.ndarray, x: np.ndarray, tolerance: float) -> None:
+        """Take from forces f (n, 3) at x (n, 3), in place, what half-spaces that are touched bear."""
+        if len(self.vertex) == 0:
+            return
+        touched = self.held(x, tolerance)
+        vertex, plane = self.vertex[touched], self.plane[touched]
+        # What is left is the part of a force along which its vertex could move: its projection onto a cone.
+        f[:] = _moved_in(f, vertex, plane, np.zeros(len(vertex)))
+
+    def put_outside(self, x: np.ndarray, held: np.ndarray | None = None) -> None:
+        """Move x (n, 3), of any precision, into the half-spaces, in place; onto the planes of those ``held`` (k,)."""
+        if len(self.vertex):
+            which = np.unique(self.vertex)
+            local = np.searchsorted(which, self.vertex)
+            x[which] = _moved_in(np.array(x[which], float), local, self.plane, self.level, held)
+
+    def held(self, x: np.ndarray, tolerance: float) -> np.ndarray:
+        """Which half-spaces are touched at x to within a tolerance [m], (k,) bool."""
+        return (self.plane * x[self.vertex]).sum(1) - self.level <= tolerance
+
+    def stiffness(self, x: np.ndarray, n: int) -> np.ndarray:
+        """A third of the trace of each node's Hessian [N/m] at x, of the first n nodes."""
+        active = self._gaps(x)[1] < 0
+        k = (np.where(active, self.k_n, 0.0) + 2 * self.k_tau) / 3
+        return np.asarray(self.spread.power(2) @ k)[:n]
+
+    def active(self, x: np.ndarray, tolerance: float) -> np.ndarray:
+        """Which contacts resist at x, and which half-spaces are touched to within a tolerance [m], (m + k,) bool."""
+        return np.concatenate([self._gaps(x)[1] < 0, self.held(x, tolerance)])
+
+    def hessian(self, active: np.ndarray, bearing: np.ndarray, U: scipy.sparse.csr_matrix) -> scipy.sparse.bsr_matrix:
+        """UᵀHU [N/m] in blocks of 3x3 for interpolation weights U (k, l) of the first k positions.
+
+        ``active`` says what resists; half-spaces count as springs of stiffness ``bearing`` (k,) [N/m] of their vertices.
+        """
+        m, k = len(self.k_n), U.shape[0]
+        unit = np.eye(3)
+        along = self.normal[:, :, None] * self.normal[:, None]
+        K = (active[:m] * self.k_n)[:, None, None] * along + self.k_tau[:, None, None] * (unit - along)
+        used = np.flatnonzero(active[:m] | (self.k_tau > 0))
+        held = np.flatnonzero(active[m:])
+        p, v = self.plane[held], self.vertex[held]
+        walls = bearing[v][:, None, None] * (p[:, :, None] * p[:, None])
+        at = scipy.sparse.csr_matrix((np.ones(len(v)), (np.arange(len(v)), v)), (len(v), k))
+        W = scipy.sparse.vstack([self.weights[used][:, :k], at]).tocsr() @ U
+        return stencil_hessian(W, np.concatenate([K[used], walls]))
+
+    def _gaps(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """C (m, 3), and min(gap, 0) (m,)."""
+        C = self.weights @ x
+        return C, np.minimum((self.normal * C).sum(1) - self.offset, 0.0)
+
+    def _across(self, C: np.ndarray) -> np.ndarray:
+        return C - (self.normal * C).sum(1)[:, None] * self.normal
+
+
+def _moved_in(
+    x: np.ndarray, vertex: np.ndarray, plane: np.ndarray, level: np.ndarray, held: np.ndarray | None = None
+) -> np.ndarray:
+    """x (n, 3) with each vertex moved to the nearest point of its half-spaces (Dykstra's projections), in place.
+
+    Of those ``held`` it is moved onto the plane. One half-space a vertex takes one round; the last ends in it.
+    """
+    if len(vertex) == 0:
+        return x
+    least = np.zeros(len(vertex)) if held is None else np.where(held, -np.inf, 0.0)
+    order = np.argsort(vertex, kind="stable")
+    turn = np.empty(len(vertex), np.int64)  # half-spaces of one vertex take turns
+    start = np.searchsorted(vertex[order], vertex[order])
+    turn[order] = np.arange(len(vertex)) - start
+    turns = [np.flatnonzero(turn == t) for t in range(turn.max() + 1)]
+    pushed = np.zeros(len(vertex))
+    for _ in range(ROUNDS if len(turns) > 1 else 1):
+        for mine in turns:
+            v, n = vertex[mine], plane[mine]
+            now = np.maximum(level[mine] - (n * x[v]).sum(1) + pushed[mine], least[mine])
+            x[v] += (now - pushed[mine])[:, None] * n
+            pushed[mine] = now
+    return x

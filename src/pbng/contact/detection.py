@@ -1,0 +1,265 @@
+"""Which vertices and edges may touch what during a step (sections 4.1, 7.2 and 11.2).
+
+Pairs are sought at the start of a step, where surfaces were kept apart by the step before: the side on which a vertex
+lies is then known, and pairs that are farther apart than they can come need not be looked at. Of each vertex the
+closest triangle of another body is taken, and of its own more than a few rings away; of each edge likewise the closest
+edge. A gap that is open costs nothing: contacts act once it closes. So nothing passes through anything else, as long as
+in one step it does not pass by the pair that it was found with.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pbng.contact.bvh import BoxTree
+from pbng.contact.contacts import Contacts
+from pbng.contact.queries import closest_edges, closest_triangles, containing_tets
+from pbng.contact.rings import neighbourhoods
+from pbng.contact.spec import ContactSpec, Surfaces
+from pbng.errors import InputError
+from pbng.topology import TRIANGLE_EDGES, unique_edges
+
+NEAR = 0.5  # radius, in mean lengths of the edges
+STIFF = 10.0  # default stiffness, in E h of the softer body
+PUSH = 0.1  # how much of the mean length of an edge a contact may push apart in one step of a motion
+AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
+TOUCHING = 1e-9  # of the radius: closer points have no direction between them
+SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Candidates: stencils, the two points of each [m], and a normal of the second side that points outward."""
+
+    vertices: np.ndarray
+    weights: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    outward: np.ndarray
+    inside: np.ndarray
+    bodies: np.ndarray
+
+
+class SurfaceDetector:
+    """Finds contacts between surfaces.
+
+    Args:
+        surfaces: What may touch.
+        X: Rest positions [m], (n_vert, 3).
+        fixed: Which vertices are prescribed, (n_vert,) bool: two of them are never in contact.
+    """
+
+    def __init__(self, surfaces: Surfaces, X: np.ndarray, fixed: np.ndarray) -> None:
+        self.surfaces, self.fixed = surfaces, fixed
+        s, n_body = surfaces, len(surfaces.names)
+        self.vertex = s.vertices
+        self.body = np.full(len(X), -1, np.int32)  # of each vertex of the surfaces
+        self.body[s.triangles] = s.body[:, None]
+        self.edges = unique_edges(s.triangles, TRIANGLE_EDGES)
+        edge_body = self.body[self.edges[:, 0]]
+        self.triangles = BoxTree(X, s.triangles, s.body)
+        self.edge_tree = BoxTree(X, self.edges, edge_body)
+        self.tets = BoxTree(X, s.tets, s.tet_body) if len(s.tets) else None
+        self.meets_others = ~np.eye(n_body, dtype=bool)
+        self.meets_itself = np.diag(s.own)
+        present = np.unique(s.body)
+        self.several, self.any_own = len(present) > 1, bool(s.own.any())
+        if self.any_own:
+            cells = s.triangles, self.edges, s.tets
+            self.near_triangles, self.near_edges, self.near_tets = (neighbourhoods(c, len(X), s.rings) for c in cells)
+        self.radius = s.radius if s.radius is not None else NEAR * float(s.spacing[present].mean())
+        self.solid = np.zeros(n_body, bool)
+        self.solid[np.unique(s.tet_body)] = True
+
+    def find(self, x0: np.ndarray, x1: np.ndarray, limited: bool, ahead: float) -> Contacts:
+        """Contacts of a step from x0 to, it is expected, x1 (n_vert, 3), give or take ``ahead`` [m].
+
+        ``limited`` keeps contacts from pushing farther than a share of an edge in this step: with inertia, what is
+        thrust apart at once flies apart.
+        """
+        s = self.surfaces
+        x0 = np.ascontiguousarray(x0, float)
+        moved = np.linalg.norm(x1 - x0, axis=1)
+        most = float(moved[self.vertex].max(initial=0.0))
+        reach = self.radius + 2 * float(s.skin.max(initial=0.0)) + moved + most + min(ahead, AHEAD * self.radius)
+        self.triangles.refit(x0)
+        pairs = []
+        if self.several:
+            pairs += self._vertex_triangle(x0, reach, self.meets_others, None)
+        if self.any_own:
+            pairs += self._vertex_triangle(x0, reach, self.meets_itself, self.near_triangles)
+        self.edge_tree.refit(x0)
+        edge_reach = reach[self.edges].max(1)
+        if self.several:
+            pairs.append(self._edge_edge(x0, edge_reach, self.meets_others, None))
+        if self.any_own:
+            pairs.append(self._edge_edge(x0, edge_reach, self.meets_itself, self.near_edges))
+        return self._contacts(pairs, limited)
+
+    def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Any) -> list[_Pairs]:
+        s, vertex = self.surfaces, self.vertex
+        own = self.body[vertex]
+        points = x[vertex]
+        asked: dict[str, Any] = {"own": own, "meets": meets, "vertex": vertex, "excluded": excluded}
+        triangle, weights, distance = closest_triangles(self.triangles, x, points, reach[vertex], **asked)
+        inside = self._inside(x, vertex, meets, excluded)
+        deep = np.flatnonzero(inside >= 0)
+        if len(deep):
+            # What is inside a solid leaves it by the closest of its triangles that it is behind.
+            only = np.zeros((len(vertex), len(s.names)), bool)
+            only[np.arange(len(vertex)), np.maximum(inside, 0)] = True
+            part = only[deep]
+            t, w, d = closest_triangles(
+                self.triangles, x, points[deep], own=np.arange(len(deep), dtype=np.int32), meets=part,
+                vertex=vertex[deep], excluded=excluded, behind=True,
+            )  # fmt: skip
+            triangle[deep], weights[deep], distance[deep] = t, w, d
+        found = np.flatnonzero(triangle >= 0)
+        corners = s.triangles[triangle[found]]
+        closest = np.einsum("kj,kji->ki", weights[found], x[corners])
+        a, b, c = x[corners].transpose(1, 0, 2)
+        stencil = np.column_stack([vertex[found], corners]).astype(np.int32)
+        signed = np.column_stack([np.ones(len(found)), -weights[found]])
+        bodies = np.column_stack([own[found], s.body[triangle[found]]])
+        outward = np.cross(b - a, c - a)
+        return [_Pairs(stencil, signed, points[found], closest, outward, inside[found] >= 0, bodies)]
+
+    def _inside(self, x: np.ndarray, vertex: np.ndarray, meets: np.ndarray, excluded: Any) -> np.ndarray:
+        """The solid that each vertex is inside of, -1 for none."""
+        out = np.full(len(vertex), -1, np.int64)
+        if self.tets is None or not (meets & self.solid).any():
+            return out
+        self.tets.refit(x)
+        near = None if excluded is None else self.near_tets
+        tet, _ = containing_tets(
+            self.tets, x, x[vertex], vertex, own=self.body[vertex], meets=meets & self.solid, excluded=near
+        )
+        found = tet >= 0
+        out[found] = self.surfaces.tet_body[tet[found]]
+        return out
+
+    def _edge_edge(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Any) -> _Pairs:
+        e = self.edges
+        body = self.body[e[:, 0]]
+        other, s, t, _ = closest_edges(self.edge_tree, x, e, reach, own=body, meets=meets, excluded=excluded)
+        proper = (other >= 0) & (np.minimum(s, 1 - s) > SIDE) & (np.minimum(t, 1 - t) > SIDE)  # else a vertex finds it
+        mine = np.flatnonzero(proper)
+        theirs = other[mine]
+        # Two edges that find each other are one contact.
+        twice = (other[theirs] == mine) & proper[theirs] & (theirs < mine)
+        mine, theirs = mine[~twice], theirs[~twice]
+        s, t = s[mine], t[mine]
+        stencil = np.column_stack([e[mine], e[theirs]]).astype(np.int32)
+        weights = np.column_stack([1 - s, s, t - 1, -t])
+        first = (1 - s)[:, None] * x[e[mine, 0]] + s[:, None] * x[e[mine, 1]]
+        second = (1 - t)[:, None] * x[e[theirs, 0]] + t[:, None] * x[e[theirs, 1]]
+        across = np.cross(x[e[mine, 1]] - x[e[mine, 0]], x[e[theirs, 1]] - x[e[theirs, 0]])
+        bodies = np.column_stack([body[mine], body[theirs]])
+        normals = self._edge_normals(x)
+        # Solids that overlap here have each its edge inside the other.
+        apart = first - second
+        overlap = ((apart * normals[theirs]).sum(1) < 0) & ((apart * normals[mine]).sum(1) > 0)
+        inside = self.solid[bodies].all(1) & overlap
+        outward = np.where(((across * normals[theirs]).sum(1) < 0)[:, None], -across, across)
+        return _Pairs(stencil, weights, first, second, outward, inside, bodies)
+
+    def _edge_normals(self, x: np.ndarray) -> np.ndarray:
+        """Sum of the normals at each edge's ends, (n_edge, 3)."""
+        a, b, c = x[self.surfaces.triangles].transpose(1, 0, 2)
+        n = np.cross(b - a, c - a)
+        total = np.zeros_like(x)
+        for k in range(3):
+            np.add.at(total, self.surfaces.triangles[:, k], n)
+        return total[self.edges].sum(1)
+
+    def _contacts(self, pairs: list[_Pairs], limited: bool) -> Contacts:
+        s = self.surfaces
+        p = _Pairs(*(np.concatenate([getattr(q, name) for q in pairs]) for name in _Pairs.__dataclass_fields__))
+        free = ~self.fixed[p.vertices].all(1)
+        p = _Pairs(*(getattr(p, name)[free] for name in _Pairs.__dataclass_fields__))
+        apart = p.first - p.second
+        distance = np.linalg.norm(apart, axis=1)
+        outward = p.outward / np.maximum(np.linalg.norm(p.outward, axis=1), 1e-300)[:, None]
+        sign = np.where(p.inside, -1.0, 1.0)
+        clear = distance > TOUCHING * self.radius
+        normal = np.where(clear[:, None], (sign / np.maximum(distance, 1e-300))[:, None] * apart, outward)
+        gap = sign * distance
+        kept = s.skin[p.bodies].sum(1)
+        spacing = s.spacing[p.bodies].min(1)
+        k_n = np.full(len(gap), s.k_n) if s.k_n is not None else STIFF * s.stiffness[p.bodies].min(1)
+        offset = np.minimum(kept, gap + PUSH * spacing) if limited else kept
+        return Contacts(
+            vertices=p.vertices,
+            weights=p.weights,
+            normal=normal,
+            offset=offset,
+            k_n=k_n,
+            k_tau=np.where(gap < kept, s.k_tau, 0.0),
+            kept=kept,
+        )
+
+    def check_start(self, x: np.ndarray) -> None:
+        """InputError if a body lies wholly inside another: then no way out is the shortest."""
+        if self.tets is None or not self.several:
+            return
+        self.tets.refit(x)
+        inside = self._inside(np.ascontiguousarray(x, float), self.vertex, self.meets_others, None)
+        body = self.body[self.vertex]
+        for b in np.unique(body):
+            solids, count = np.unique(inside[body == b], return_counts=True)
+            if len(solids) == 1 and solids[0] >= 0:
+                names = self.surfaces.names
+                raise InputError(
+                    f"contact: body {names[b]!r} starts fully inside body {names[solids[0]]!r} ({count[0]} vertices);"
+                    " move one of them"
+                )
+
+
+@dataclass
+class Seconds:
+    """Where the time of contact goes [s]."""
+
+    surfaces: float = 0.0
+    colliders: float = 0.0
+
+
+class Detector:
+    """Finds everything that may touch in a step.
+
+    Args:
+        spec: What may touch.
+        X: Rest positions [m], (n_vert, 3).
+        fixed: Which vertices are prescribed.
+    """
+
+    def __init__(self, spec: ContactSpec, X: np.ndarray, fixed: np.ndarray) -> None:
+        self.spec = spec
+        self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
+        self.free = spec.surface[~fixed[spec.surface]]
+        self.seconds = Seconds()
+
+    def find(
+        self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, limited: bool = False, ahead: float = 0.0
+    ) -> Contacts:
+        """Contacts of a step from x0 at time t0 to, it is expected, x1 at t1 (n_vert, 3); see the module.
+
+        ``limited`` is for motion (:meth:`SurfaceDetector.find`); ``ahead`` [m] is how far from x1 vertices may come to
+        lie.
+        """
+        clock = time.perf_counter()
+        found = self.surfaces.find(x0, x1, limited, ahead) if self.surfaces else Contacts()
+        now = time.perf_counter()
+        self.seconds.surfaces += now - clock
+        touches = [c.touch(x0[self.free], x1[self.free], t0, t1, self.spec.margin + ahead) for c in self.spec.colliders]
+        if touches:
+            normal = np.concatenate([t.normal for t in touches])
+            found = replace(
+                found,
+                vertex=self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32),
+                plane=normal,
+                level=(normal * np.concatenate([t.point for t in touches])).sum(1),
+            )
+        self.seconds.colliders += time.perf_counter() - now
+        return found

@@ -1,0 +1,281 @@
+"""Nodes in contact: a layout of their own, made anew where contacts change, swept after the others (section 10.1).
+
+A node in contact sees, besides its elements, one-sided terms: the springs of contacts and the half-spaces of colliders.
+With u = A⁻¹f its step without them, its local problem is convex,
+
+    min ½ |d - ω u|²_A + Σ_c ½ ω k_c min(g_c + w_c n_c·d, 0)²     with  g_c + n_c·d >= 0 for half-spaces,
+
+and its dual has one multiplier a contact, the force in it over ω. Each is set in turn to the value that is best given
+the others, exact at once for a single contact, starting from the last sweep's. As for a node without contact, the
+energy falls for any 0 < ω < 2: ωu - d is ω times a subgradient of the contacts' energy, and that is convex.
+
+For the time of its contact a node is held in the static layout by a Hessian as good as infinite, and laid out in blocks
+of its own, with colours of their own: contacts couple nodes that elements do not.
+"""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from numba import uint64
+
+from pbng.coloring import recolor
+from pbng.contact.contacts import Contacts
+from pbng.dispatch import call, specialised
+from pbng.elements.base import AHEAD, W
+from pbng.jit import compile_seconds, inline
+from pbng.linalg import dot, scale, solve_spd
+from pbng.packing import NODAL, Packed
+from pbng.parallel import array, body, rows, run, scratch
+from pbng.problem import Problem
+from pbng.sweep import aligned_part
+
+HELD = 1e30  # diagonal of the Hessian of a node that is swept elsewhere: it does not move
+ROUNDS = 8  # of multipliers of a node with several contacts
+ROW = 11  # numbers of an incidence: own weight, sum of all, 3 others, normal, offset, compliance, tangential stiffness
+_1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(1, 12))
+
+
+class ContactNodes:
+    """Layout and sweep of the nodes in contact of a packed problem.
+
+    Args:
+        problem: What is solved.
+        packed: Its layout.
+        surface: Vertices that may come into contact, (n,), ascending.
+    """
+
+    def __init__(self, problem: Problem, packed: Packed, surface: np.ndarray) -> None:
+        self.problem, self.packed, self.surface = problem, packed, surface
+        self.neighbours = _neighbours(problem, surface)
+        self.color = problem.color.copy()  # of the last step, for nodes that were in contact then
+        self.node = np.empty(0, np.int64)  # in contact, in order of the problem
+        self.recolored = self.repacked = 0  # nodes so far, and how long it took [s]
+        self.seconds = 0.0
+        self.others = replace(packed, nodal=packed.nodal.copy())  # what is swept of the rest
+        self.color_start = np.zeros(1, np.int64)
+
+    def update(self, contacts: Contacts) -> None:
+        """Take the contacts of a new step."""
+        start = time.perf_counter() - compile_seconds()
+        problem = self.problem
+        found = np.zeros(problem.n_vert, bool)
+        found[contacts.vertices] = True
+        found[contacts.vertex] = True
+        node = np.flatnonzero(found & ~problem.fixed)
+        was = np.zeros(problem.n_vert, bool)
+        was[self.node] = True
+        new = node[~was[node]]
+        self.color[new] = problem.color[new]
+        before = self.color[node]
+        recolor(node, self.color, *self.neighbours, contacts.vertices, found & ~problem.fixed)
+        recolored = int((self.color[node] != before).sum())
+        self.recolored += recolored
+        if recolored or not np.array_equal(node, self.node):
+            self.node = node
+            self._lay_out()
+        self._incidences(contacts)
+        self.seconds += time.perf_counter() - compile_seconds() - start
+
+    def _lay_out(self) -> None:
+        """Blocks of the nodes in contact, and their places in the static layout held."""
+        packed, layout = self.packed, self.packed.layout
+        inside = np.zeros(self.problem.n_vert, bool)
+        inside[self.node] = True
+        order = self.problem.order[inside[self.problem.order]]
+        self.color_start, node = layout.numbering(order, self.color)
+        self.rows = layout.rows(node, packed.places, len(node) // W)
+        self.real = node >= 0
+        self.owner = np.where(self.real, node, np.repeat(node[::W], W))
+        self.place = np.where(self.real, 4 * packed.slot[self.owner], -1 - 4 * packed.slot[self.owner])
+        self.repacked += len(self.node)
+        self.others.nodal[:] = packed.nodal
+        slot = packed.slot[self.node]
+        for to, source, _ in packed.carried:  # nor do compounds that would carry them along
+            slot = np.concatenate([slot, source[np.isin(to, slot)]])
+        held = self.others.nodal.reshape(-1, NODAL, W)
+        for k in (3, 6, 8):
+            held[slot // W, k, slot % W] = HELD
+
+    def _incidences(self, contacts: Contacts) -> None:
+        """What each lane sees of the contacts."""
+        c, packed, dtype = contacts, self.packed, self.packed.dtype
+        m = len(c.vertices)
+        corner = c.vertices.ravel()
+        contact, which = np.repeat(np.arange(m), 4), np.tile(np.arange(4), m)
+        mine = np.flatnonzero(~self.problem.fixed[corner] & (c.weights.ravel() != 0))
+        contact, which = contact[mine], which[mine]
+        own = np.concatenate([corner[mine], c.vertex[~self.problem.fixed[c.vertex]]])
+        walls = np.flatnonzero(~self.problem.fixed[c.vertex])
+        rest = (which[:, None] + np.arange(1, 4)) % 4
+        row = np.zeros((len(own), ROW))
+        n = len(mine)
+        row[:n, 0] = c.weights[contact, which]
+        row[:n, 2:5] = c.weights[contact[:, None], rest]
+        row[:n, 5:8] = c.normal[contact]
+        # Offsets hold for absolute positions only where weights do not sum to zero.
+        row[:n, 8] = c.offset[contact]
+        row[:n, 9] = 1 / c.k_n[contact]
+        row[:n, 10] = c.k_tau[contact]
+        row[n:, 0] = row[n:, 1] = 1
+        row[n:, 5:8] = c.plane[walls]
+        row[n:, 8] = c.level[walls] - c.plane[walls] @ packed.origin
+        other = np.zeros((len(own), 3), np.uint32)
+        other[:n] = 4 * packed.slot[c.vertices[contact[:, None], rest]]
+        other[n:] = (4 * packed.slot[c.vertex[walls]])[:, None]
+        order = np.argsort(own, kind="stable")
+        count = np.bincount(own, minlength=self.problem.n_vert)
+        first = np.concatenate([[0], np.cumsum(count)])
+        lanes = self.owner[self.real] if len(self.node) else np.empty(0, np.int64)
+        per_lane = np.zeros(len(self.real) if len(self.node) else 0, np.int64)
+        if len(self.node):
+            per_lane[self.real] = count[lanes]
+        self.first = np.concatenate([[0], np.cumsum(per_lane)])
+        at = np.repeat(first[lanes], count[lanes]) + _counting(count[lanes])
+        taken = order[at]
+        self.other, self.row = np.ascontiguousarray(other[taken]), np.ascontiguousarray(row[taken], dtype)
+        self.force = np.zeros(len(taken), dtype)
+
+    def sweep(self, x: np.ndarray, omega: float) -> None:
+        """Update every node in contact once, in place."""
+        if len(self.node) == 0:
+            return
+        p, r = self.packed, self.rows
+        arrays = (
+            x, r.seg_start, r.seg, r.idx, r.coef, r.nodal, p.parameters, np.array([omega], p.dtype), self.place,
+            self.first, self.other, self.row, self.force,
+        )  # fmt: skip
+        blocks = specialised(make_contact_sweep, p.functions, p.dtype)
+        run(blocks, arrays, np.arange(len(self.color_start) - 1), self.color_start, 4)
+
+
+def _counting(count: np.ndarray) -> np.ndarray:
+    """0 .. count[0] - 1, 0 .. count[1] - 1, ..."""
+    end = np.cumsum(count)
+    return np.arange(end[-1] if len(end) else 0) - np.repeat(end - count, count)
+
+
+def _neighbours(problem: Problem, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each vertex the others of ``surface`` with which it shares a cell, in compressed rows (start, vertex)."""
+    graph = scipy.sparse.csr_matrix((problem.n_vert, problem.n_vert), dtype=np.int8)
+    chosen = np.zeros(problem.n_vert, bool)
+    chosen[surface] = True
+    for c in problem.couplings:
+        vertices = c.cells[:, : c.corners]
+        at, corner = np.nonzero(chosen[vertices])
+        ones = np.ones(len(at), np.int8)
+        shape = len(vertices), problem.n_vert
+        incidence = scipy.sparse.csr_matrix((ones, (at, vertices[at, corner])), shape)
+        graph = graph + (incidence.T @ incidence).astype(bool).astype(np.int8)
+    graph = graph.tocsr()
+    graph.setdiag(0)
+    graph.eliminate_zeros()
+    graph.sort_indices()
+    return graph.indptr.astype(np.int64), graph.indices.astype(np.int64)
+
+
+def make_contact_sweep(key: str, dtype: np.dtype) -> Any:
+    """Body of :meth:`ContactNodes.sweep` for blocks low .. high of one colour."""
+    real = dtype.type
+    size = 12 * W
+
+    @body
+    def blocks(arguments, low, high):
+        x, seg_start, seg = array(arguments, 0, real), array(arguments, 1, np.int64), rows(arguments, 2, 5, np.int64)
+        idx, coef, nodal = array(arguments, 3, np.uint32), array(arguments, 4, real), array(arguments, 5, real)
+        par, omega = array(arguments, 6, real), array(arguments, 7, real)[0]
+        place, first = array(arguments, 8, np.int64), array(arguments, 9, np.int64)
+        other, row = rows(arguments, 10, 3, np.uint32), rows(arguments, 11, ROW, real)
+        force = array(arguments, 12, real)
+        acc = scratch(size, real)
+        g = aligned_part(np.empty(12 * W * AHEAD + W, real))
+        for b in range(low, high):
+            for l_ in range(W):
+                l = uint64(l_)
+                at = place[W * b + l_]
+                p = uint64(at if at >= 0 else -1 - at)
+                for k in range(NODAL):
+                    acc[uint64(W * k) + l] = nodal[uint64((NODAL * b + k) * W) + l]
+                acc[_9 + l] = x[p]
+                acc[_10 + l] = x[p + uint64(1)]
+                acc[_11 + l] = x[p + uint64(2)]
+            for s in range(seg_start[b], seg_start[b + 1]):
+                k, p, n, i, c = seg[s]
+                call(key, k, (n, uint64(i), uint64(c), x, idx, coef, par, uint64(p), g, acc))
+            for l_ in range(W):
+                at = place[W * b + l_]
+                if at >= 0:
+                    low_c, high_c = first[W * b + l_], first[W * b + l_ + 1]
+                    _step(uint64(at), x, acc, uint64(l_), omega, low_c, high_c, other, row, force)
+
+    return blocks
+
+
+@inline
+def _step(at, x, acc, l, omega, low, high, other, row, force):
+    """Solve the local problem of the node in lane l, whose position is at x[at], and move it."""
+    real = type(omega)
+    a0, a1, a2 = acc[_3 + l], acc[_4 + l], acc[_5 + l]
+    a3, a4, a5 = acc[_6 + l], acc[_7 + l], acc[_8 + l]
+    f0, f1, f2 = acc[l], acc[_1 + l], acc[_2 + l]
+    for c in range(low, high):
+        k = row[c, 10]
+        if k > real(0):
+            # What sticks is an ordinary spring across the normal.
+            w = row[c, 0]
+            n = row[c, 5], row[c, 6], row[c, 7]
+            C = _gap_vector(c, at, x, other, row)
+            along = dot(n, C)
+            f0 -= w * k * (C[0] - along * n[0])
+            f1 -= w * k * (C[1] - along * n[1])
+            f2 -= w * k * (C[2] - along * n[2])
+            s = w * w * k
+            a0 += s * (real(1) - n[0] * n[0])
+            a1 -= s * n[0] * n[1]
+            a2 -= s * n[0] * n[2]
+            a3 += s * (real(1) - n[1] * n[1])
+            a4 -= s * n[1] * n[2]
+            a5 += s * (real(1) - n[2] * n[2])
+    d0, d1, d2 = solve_spd(a0, a1, a2, a3, a4, a5, f0, f1, f2)
+    d0, d1, d2 = omega * d0, omega * d1, omega * d2
+    for c in range(low, high):
+        w, p = row[c, 0], force[c]
+        if p > real(0):
+            y0, y1, y2 = solve_spd(a0, a1, a2, a3, a4, a5, w * row[c, 5], w * row[c, 6], w * row[c, 7])
+            d0 += p * y0
+            d1 += p * y1
+            d2 += p * y2
+    for _ in range(ROUNDS if high - low > 1 else 1):
+        for c in range(low, high):
+            w = row[c, 0]
+            m = scale(w, (row[c, 5], row[c, 6], row[c, 7]))
+            y0, y1, y2 = solve_spd(a0, a1, a2, a3, a4, a5, m[0], m[1], m[2])
+            C = _gap_vector(c, at, x, other, row)
+            gap = row[c, 5] * C[0] + row[c, 6] * C[1] + row[c, 7] * C[2] - row[c, 8]
+            soft = row[c, 9] / omega
+            q = m[0] * y0 + m[1] * y1 + m[2] * y2 + soft
+            left = gap + m[0] * d0 + m[1] * d1 + m[2] * d2 + force[c] * soft
+            p = max(force[c] - left / q, real(0))
+            change = p - force[c]
+            force[c] = p
+            d0 += change * y0
+            d1 += change * y1
+            d2 += change * y2
+    x[at] = acc[_9 + l] + d0
+    x[at + uint64(1)] = acc[_10 + l] + d1
+    x[at + uint64(2)] = acc[_11 + l] + d2
+
+
+@inline
+def _gap_vector(c, at, x, other, row):
+    """C = Σ_j w_j x_j of a contact, from differences to the node's own position."""
+    a, b, e = uint64(other[c, 0]), uint64(other[c, 1]), uint64(other[c, 2])
+    s, u, v, w = row[c, 1], row[c, 2], row[c, 3], row[c, 4]
+    x0, x1, x2 = x[at], x[at + uint64(1)], x[at + uint64(2)]
+    return (
+        s * x0 + u * (x[a] - x0) + v * (x[b] - x0) + w * (x[e] - x0),
+        s * x1 + u * (x[a + uint64(1)] - x1) + v * (x[b + uint64(1)] - x1) + w * (x[e + uint64(1)] - x1),
+        s * x2 + u * (x[a + uint64(2)] - x2) + v * (x[b + uint64(2)] - x2) + w * (x[e + uint64(2)] - x2),
+    )

@@ -1,0 +1,372 @@
+"""Closest triangles and edges and containing tets, found with a tree; all points at once, in parallel.
+
+What a query may find is restricted by keywords, all optional, which mean the same everywhere:
+
+``own`` (k,) the group of each query, and ``meets`` (groups of queries, groups of the tree) bool, which of them look at
+which: ``~numpy.eye(n, dtype=bool)`` for contact with others, ``numpy.eye(n, dtype=bool)`` with oneself; a row of False
+is not asked, a column of False is never found. ``excluded`` = (start, ids): for each vertex the sorted numbers of
+primitives that it never finds, as :func:`pbng.contact.rings.neighbourhoods` gives them; ``vertex`` (k,) tells which
+vertex a point is.
+
+Results are the same for any number of threads. Of primitives at just the same distance the lowest is found.
+"""
+
+from math import sqrt
+
+import numpy as np
+
+from pbng.contact.bvh import DEPTH, BoxTree
+from pbng.contact.primitives import closest_on_triangle, closest_segments, tet_weights
+from pbng.jit import inline
+from pbng.linalg import cross, dot, sub
+from pbng.parallel import array, body, each, rows, scratch
+
+GRAIN = 128  # queries that a thread takes at a time
+NONE = 1 << 31  # above every number
+Excluded = tuple[np.ndarray, np.ndarray]
+
+
+def closest_triangles(
+    tree: BoxTree,
+    x: np.ndarray,
+    points: np.ndarray,
+    reach: float | np.ndarray = np.inf,
+    *,
+    own: np.ndarray | None = None,
+    meets: np.ndarray | None = None,
+    vertex: np.ndarray | None = None,
+    excluded: Excluded | None = None,
+    behind: bool = False,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The triangle of a tree closest to each point.
+
+    Args:
+        tree: Tree over triangles, fitted to x.
+        x: Positions (n_vert, 3) [m].
+        points: Points (k, 3) [m].
+        reach: How far to look [m], a number or one a point (k,); below 0 a point is not asked.
+        own, meets, vertex, excluded: What may be found, see above.
+        behind: Find only triangles that the point is behind: (point - closest point) · normal < 0.
+
+    Returns:
+        Triangles (k,) int32, -1 for none; weights (k, 3) of the closest points; distances (k,) [m], infinite for none.
+    """
+    points = np.ascontiguousarray(points, np.float64)
+    k = len(points)
+    found, weights, distance = np.empty(k, np.int32), np.empty((k, 3)), np.empty(k)
+    arrays = (points, np.array([behind], np.int64), found, weights, distance)
+    each(_closest_triangles, (*_common(tree, x, k, reach, own, meets, vertex, excluded), *arrays), k, GRAIN)
+    return found, weights, distance
+
+
+def closest_edges(
+    tree: BoxTree,
+    x: np.ndarray,
+    edges: np.ndarray,
+    reach: float | np.ndarray = np.inf,
+    *,
+    own: np.ndarray | None = None,
+    meets: np.ndarray | None = None,
+    excluded: Excluded | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The edge of a tree closest to each edge, among those that share no vertex with it.
+
+    Args:
+        tree: Tree over edges, fitted to x.
+        x: Positions (n_vert, 3) [m].
+        edges: Vertices (k, 2) of the edges that ask.
+        reach: How far to look [m], a number or one an edge (k,); below 0 an edge is not asked.
+        own, meets, excluded: What may be found, see above; what either vertex excludes is excluded.
+
+    Returns:
+        Edges (k,) int32 of the tree, -1 for none; the closest points' parameters s (k,) along the edge that asks and
+        t (k,) along the one found, from 0 at the first vertex to 1; distances (k,) [m], infinite for none.
+    """
+    edges = _int32(edges).reshape(-1, 2)
+    k = len(edges)
+    found, s, t, distance = np.empty(k, np.int32), np.empty(k), np.empty(k), np.empty(k)
+    common = _common(tree, x, k, reach, own, meets, None, excluded)
+    each(_closest_edges, (*common, edges, found, s, t, distance), k, GRAIN)
+    return found, s, t, distance
+
+
+def containing_tets(
+    tree: BoxTree,
+    x: np.ndarray,
+    points: np.ndarray,
+    vertex: np.ndarray | None = None,
+    *,
+    own: np.ndarray | None = None,
+    meets: np.ndarray | None = None,
+    excluded: Excluded | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The tet of a tree that contains each point, of several the lowest; inverted tets contain points too.
+
+    Args:
+        tree: Tree over tets, fitted to x.
+        x: Positions (n_vert, 3) [m].
+        points: Points (k, 3) [m].
+        vertex: The vertex that each point is, (k,): its own tets are left out.
+        own, meets, excluded: What may be found, see above.
+
+    Returns:
+        Tets (k,) int32, -1 for none, and the weights (k, 4) of the points there, none negative.
+    """
+    points = np.ascontiguousarray(points, np.float64)
+    k = len(points)
+    found, weights = np.empty(k, np.int32), np.empty((k, 4))
+    numbers = np.array([vertex is not None], np.int64)
+    arrays = (points, numbers, found, weights)
+    each(_containing_tets, (*_common(tree, x, k, 0.0, own, meets, vertex, excluded), *arrays), k, GRAIN)
+    return found, weights
+
+
+def _common(
+    tree: BoxTree,
+    x: np.ndarray,
+    k: int,
+    reach: float | np.ndarray,
+    own: np.ndarray | None,
+    meets: np.ndarray | None,
+    vertex: np.ndarray | None,
+    excluded: Excluded | None,
+) -> tuple[np.ndarray, ...]:
+    """The first 12 arguments of every body."""
+    reaches = np.array(np.broadcast_to(np.asarray(reach, np.float64), (k,)))
+    if meets is None:
+        own, meets = None, np.ones((1, tree.n_group), bool)
+    elif own is None:
+        raise TypeError("meets needs own")
+    meets = np.ascontiguousarray(meets, np.bool_)
+    assert meets.shape[1] >= tree.n_group, "meets has no column for some group"
+    if own is not None:
+        reaches[~meets.any(1)[own]] = -1.0
+    start, ids = (np.zeros(1, np.int64), np.zeros(1, np.int32)) if excluded is None else excluded
+    sizes = np.array([own is not None, meets.shape[1], excluded is not None], np.int64)
+    zero = np.zeros(1, np.int32)
+    return (
+        tree.nodes, tree.boxes, tree.order, tree.sorted_cells, np.ascontiguousarray(x, np.float64), reaches,
+        sizes, meets, zero if own is None else _int32(own), zero if vertex is None else _int32(vertex),
+        np.ascontiguousarray(start, np.int64), _int32(ids),
+    )  # fmt: skip
+
+
+def _int32(a: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(a, np.int32)
+
+
+@inline
+def _point(x, v):
+    return x[v, 0], x[v, 1], x[v, 2]
+
+
+@inline
+def _gap2(boxes, i, low, high):
+    """Squared distance of box i from the box between two corners."""
+    dx = max(boxes[i, 0] - high[0], 0.0, low[0] - boxes[i, 3])
+    dy = max(boxes[i, 1] - high[1], 0.0, low[1] - boxes[i, 4])
+    dz = max(boxes[i, 2] - high[2], 0.0, low[2] - boxes[i, 5])
+    return dx * dx + dy * dy + dz * dz
+
+
+@inline
+def _slack(boxes):
+    """A distance above the rounding errors of distances to what is in the tree [m]."""
+    return 1e-15 * (abs(boxes[0, 3] - boxes[0, 0]) + abs(boxes[0, 4] - boxes[0, 1]) + abs(boxes[0, 5] - boxes[0, 2]))
+
+
+@inline
+def _bound(best, slack):
+    """Squared distance from which on boxes hold nothing as close as ``best``, squared, rounding included."""
+    r = sqrt(best) * (1.0 + 1e-14) + slack
+    return r * r
+
+
+@inline
+def _is_listed(start, ids, v, t):
+    """Whether t is among the numbers of v."""
+    low, high = start[v], start[v + 1]
+    while low < high:
+        middle = (low + high) >> 1
+        if ids[middle] < t:
+            low = middle + 1
+        else:
+            high = middle
+    return low < start[v + 1] and ids[low] == t
+
+
+@body
+def _closest_triangles(arguments, low, high):
+    """Body of :func:`closest_triangles` for points low .. high."""
+    nodes, boxes = rows(arguments, 0, 4, np.int32), rows(arguments, 1, 6, np.float64)
+    order, cells, x = array(arguments, 2, np.int32), rows(arguments, 3, 3, np.int32), rows(arguments, 4, 3, np.float64)
+    reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
+    own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
+    start, ids = array(arguments, 10, np.int64), array(arguments, 11, np.int32)
+    points, behind = rows(arguments, 12, 3, np.float64), array(arguments, 13, np.int64)[0]
+    found, weights = array(arguments, 14, np.int32), rows(arguments, 15, 3, np.float64)
+    distance = array(arguments, 16, np.float64)
+    grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
+    stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
+    slack = _slack(boxes)
+    for q in range(low, high):
+        found[q], distance[q] = -1, np.inf
+        weights[q, 0] = weights[q, 1] = weights[q, 2] = 0.0
+        if not reach[q] >= 0.0:
+            continue
+        p = _point(points, q)
+        row = own[q] * n_group if grouped else 0
+        best, closest = reach[q] * reach[q], NONE
+        u = v = w = 0.0
+        bound = _bound(best, slack)
+        top, i = 0, 0
+        gap = _gap2(boxes, 0, p, p)
+        while True:
+            if gap <= bound and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
+                child = nodes[i, 0]
+                if child >= 0:
+                    near, far = _gap2(boxes, child, p, p), _gap2(boxes, child + 1, p, p)
+                    i, child = child, child + 1
+                    if far < near:
+                        i, child, near, far = child, i, far, near
+                    if far <= bound:
+                        stack[top], gaps[top] = child, far
+                        top += 1
+                    gap = near
+                    continue
+                for e in range(nodes[i, 1], nodes[i, 2]):
+                    a, b, c = _point(x, cells[e, 0]), _point(x, cells[e, 1]), _point(x, cells[e, 2])
+                    weight, offset, d2 = closest_on_triangle(p, a, b, c)
+                    t = order[e]
+                    if not d2 <= best or (d2 == best and t >= closest):  # not a number is not found
+                        continue
+                    if behind and not dot(offset, cross(sub(b, a), sub(c, a))) > 0.0:
+                        continue
+                    if listed and _is_listed(start, ids, vertex[q], t):
+                        continue
+                    best, closest = d2, t
+                    u, v, w = weight
+                    bound = _bound(best, slack)
+            if top == 0:
+                break
+            top -= 1
+            i, gap = stack[top], gaps[top]
+        if closest < NONE:
+            found[q], distance[q] = closest, sqrt(best)
+            weights[q, 0], weights[q, 1], weights[q, 2] = u, v, w
+
+
+@body
+def _closest_edges(arguments, low, high):
+    """Body of :func:`closest_edges` for edges low .. high."""
+    nodes, boxes = rows(arguments, 0, 4, np.int32), rows(arguments, 1, 6, np.float64)
+    order, cells, x = array(arguments, 2, np.int32), rows(arguments, 3, 2, np.int32), rows(arguments, 4, 3, np.float64)
+    reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
+    own, start, ids = array(arguments, 8, np.int32), array(arguments, 10, np.int64), array(arguments, 11, np.int32)
+    edges, found = rows(arguments, 12, 2, np.int32), array(arguments, 13, np.int32)
+    s, t = array(arguments, 14, np.float64), array(arguments, 15, np.float64)
+    distance = array(arguments, 16, np.float64)
+    grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
+    stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
+    slack = _slack(boxes)
+    for q in range(low, high):
+        found[q], s[q], t[q], distance[q] = -1, 0.0, 0.0, np.inf
+        if not reach[q] >= 0.0:
+            continue
+        v, w = edges[q, 0], edges[q, 1]
+        a, b = _point(x, v), _point(x, w)
+        lowest = min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2])
+        highest = max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2])
+        row = own[q] * n_group if grouped else 0
+        best, closest = reach[q] * reach[q], NONE
+        along, across = 0.0, 0.0
+        bound = _bound(best, slack)
+        top, i = 0, 0
+        gap = _gap2(boxes, 0, lowest, highest)
+        while True:
+            if gap <= bound and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
+                child = nodes[i, 0]
+                if child >= 0:
+                    near, far = _gap2(boxes, child, lowest, highest), _gap2(boxes, child + 1, lowest, highest)
+                    i, child = child, child + 1
+                    if far < near:
+                        i, child, near, far = child, i, far, near
+                    if far <= bound:
+                        stack[top], gaps[top] = child, far
+                        top += 1
+                    gap = near
+                    continue
+                for e in range(nodes[i, 1], nodes[i, 2]):
+                    c, d = cells[e, 0], cells[e, 1]
+                    if c == v or c == w or d == v or d == w:  # noqa: SIM109 (a tuple would be searched)
+                        continue
+                    s1, t1, _, d2 = closest_segments(a, b, _point(x, c), _point(x, d))
+                    edge = order[e]
+                    if not d2 <= best or (d2 == best and edge >= closest):
+                        continue
+                    if listed and (_is_listed(start, ids, v, edge) or _is_listed(start, ids, w, edge)):
+                        continue
+                    best, closest, along, across = d2, edge, s1, t1
+                    bound = _bound(best, slack)
+            if top == 0:
+                break
+            top -= 1
+            i, gap = stack[top], gaps[top]
+        if closest < NONE:
+            found[q], s[q], t[q], distance[q] = closest, along, across, sqrt(best)
+
+
+@body
+def _containing_tets(arguments, low, high):
+    """Body of :func:`containing_tets` for points low .. high."""
+    nodes, boxes = rows(arguments, 0, 4, np.int32), rows(arguments, 1, 6, np.float64)
+    order, cells, x = array(arguments, 2, np.int32), rows(arguments, 3, 4, np.int32), rows(arguments, 4, 3, np.float64)
+    reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
+    own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
+    start, ids = array(arguments, 10, np.int64), array(arguments, 11, np.int32)
+    points, numbers, found = (
+        rows(arguments, 12, 3, np.float64),
+        array(arguments, 13, np.int64),
+        array(arguments, 14, np.int32),
+    )
+    weights = rows(arguments, 15, 4, np.float64)
+    grouped, n_group, listed, named = sizes[0], sizes[1], sizes[2], numbers[0]
+    stack = scratch(DEPTH, np.int32)
+    for q in range(low, high):
+        found[q] = -1
+        weights[q, 0] = weights[q, 1] = weights[q, 2] = weights[q, 3] = 0.0
+        if not reach[q] >= 0.0:
+            continue
+        p = _point(points, q)
+        row = own[q] * n_group if grouped else 0
+        v = vertex[q] if named else -1
+        lowest = NONE
+        stack[0], top = 0, 1
+        while top > 0:
+            top -= 1
+            i = stack[top]
+            if nodes[i, 3] >= 0 and not meets[row + nodes[i, 3]]:
+                continue
+            child = nodes[i, 0]
+            if child >= 0:
+                if _gap2(boxes, child + 1, p, p) <= 0.0:
+                    stack[top] = child + 1
+                    top += 1
+                if _gap2(boxes, child, p, p) <= 0.0:
+                    stack[top] = child
+                    top += 1
+                continue
+            for e in range(nodes[i, 1], nodes[i, 2]):
+                t = order[e]
+                a, b, c, d = cells[e, 0], cells[e, 1], cells[e, 2], cells[e, 3]
+                if t >= lowest or a == v or b == v or c == v or d == v:
+                    continue
+                (wa, wb, wc, wd), _ = tet_weights(p, _point(x, a), _point(x, b), _point(x, c), _point(x, d))
+                if not (wa >= 0.0 and wb >= 0.0 and wc >= 0.0 and wd >= 0.0):
+                    continue
+                if listed and _is_listed(start, ids, v, t):
+                    continue
+                lowest = t
+                weights[q, 0], weights[q, 1], weights[q, 2], weights[q, 3] = wa, wb, wc, wd
+        if lowest < NONE:
+            found[q] = lowest

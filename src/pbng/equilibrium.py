@@ -1,0 +1,212 @@
+"""One equilibrium, with what touches found anew in rounds until it no longer changes."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pbng.contact.contacts import Contacts
+from pbng.contact.detection import Detector
+from pbng.problem import Problem
+from pbng.solvers.base import Budget, Method, Monitor, Result, Solver, Status
+from pbng.solvers.loop import run
+
+ROUNDS = 40  # in which contacts are found anew
+FIRST_ROUND = 2  # length of the first, in evaluations of the residual; each further one may be twice as long
+
+
+@dataclass(frozen=True, eq=False)
+class ContactReport:
+    """What touched at the end of a frame.
+
+    Attributes:
+        pairs: Contacts between surfaces that resisted.
+        walls: Vertices that touched a collider.
+        deepest, mean: Penetration of those contacts [m]: what is missing of the distance that is kept.
+        size: Diagonal of the bounding box of the scene at rest [m], to compare these with.
+        vertices: Vertices in contact, ascending, (n,).
+        recolored: Nodes that got another colour in the frame.
+        repacked: Nodes laid out anew in the frame.
+        detect_seconds, pack_seconds: Time [s] of the frame that finding contacts took, and colouring and packing.
+        seconds: That of the whole frame [s].
+    """
+
+    pairs: int
+    walls: int
+    deepest: float
+    mean: float
+    size: float
+    vertices: np.ndarray
+    recolored: int
+    repacked: int
+    detect_seconds: float
+    pack_seconds: float
+    seconds: float
+
+
+class Toucher:
+    """Finds contacts for a method, step by step, and reports on them.
+
+    Args:
+        problem: A problem with contact.
+        method: What solves it.
+    """
+
+    def __init__(self, problem: Problem, method: Method) -> None:
+        assert problem.contact is not None
+        self.problem, self.method = problem, method
+        self.detector = Detector(problem.contact, problem.X, problem.fixed)
+        self.contacts = Contacts()
+        self.size = float(np.linalg.norm(np.ptp(problem.X, axis=0)))
+        self.began()
+
+    def began(self) -> None:
+        """A frame begins."""
+        self.since, self.seconds = time.perf_counter(), 0.0
+        self.before = self._work()
+
+    def find(
+        self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, limited: bool = False, ahead: float = 0.0
+    ) -> Contacts:
+        """As :meth:`pbng.contact.detection.Detector.find`, timed."""
+        start = time.perf_counter()
+        self.contacts = self.detector.find(x0, x1, t0, t1, limited, ahead)
+        self.seconds += time.perf_counter() - start
+        return self.contacts
+
+    def report(self, x: np.ndarray) -> ContactReport:
+        """What touches at x (n_vert, 3), and what the frame took."""
+        c = self.contacts
+        clearance = c.clearance(x)
+        touching = clearance < 0
+        depth = -clearance[touching]
+        walls = (c.plane * x[c.vertex]).sum(1) - c.level <= 1e-6 * self.size
+        vertices = np.unique(np.concatenate([c.vertices[touching].ravel(), c.vertex[walls]]))
+        recolored, repacked, packing = (b - a for a, b in zip(self.before, self._work()))
+        return ContactReport(
+            pairs=len(depth),
+            walls=len(np.unique(c.vertex[walls])),
+            deepest=float(depth.max(initial=0.0)),
+            mean=float(depth.mean()) if len(depth) else 0.0,
+            size=self.size,
+            vertices=vertices,
+            recolored=int(recolored),
+            repacked=int(repacked),
+            detect_seconds=self.seconds,
+            pack_seconds=packing,
+            seconds=time.perf_counter() - self.since,
+        )
+
+    def _work(self) -> tuple[float, float, float]:
+        nodes = list(self.method.contact_nodes.values())
+        return (
+            sum(n.recolored for n in nodes), sum(n.repacked for n in nodes), sum(n.seconds for n in nodes)
+        )  # fmt: skip
+
+
+class Equilibria:
+    """Equilibria at one time after another, each from the one before.
+
+    Args:
+        problem: What is solved, until ``problem.until``.
+        solver: What solves it.
+        x: Where to start from, (n_vert, 3) [m].
+        later: Makes the problem that holds from a time on: ``later(at=t)``.
+    """
+
+    def __init__(
+        self, problem: Problem, solver: Solver, x: np.ndarray, later: Callable[..., Problem] | None = None
+    ) -> None:
+        self.solver, self.later, self.x, self.t = solver, later, x, 0.0
+        self._take(problem)
+
+    def _take(self, problem: Problem) -> None:
+        self.problem, self.method = problem, self.solver.set_up(problem)
+        self.toucher = Toucher(problem, self.method) if problem.contact else None
+
+    def at(self, t: float, budget: Budget, monitor: Monitor | None) -> tuple[Result, ContactReport | None]:
+        """The equilibrium at time t [s], and what touches there."""
+        if self.later is not None and t >= self.problem.until:
+            self._take(self.later(at=t))
+        if self.toucher:
+            self.toucher.began()
+        result = equilibrium(self.method, self.toucher, self.x, self.t, t, budget, monitor)
+        if result.status is not Status.INTERRUPTED:
+            self.x, self.t = np.asarray(result.x, float), t
+        return result, self.toucher.report(self.x) if self.toucher else None
+
+
+def equilibrium(
+    method: Method,
+    toucher: Toucher | None,
+    x: np.ndarray,
+    t0: float,
+    t: float,
+    budget: Budget,
+    monitor: Monitor | None = None,
+) -> Result:
+    """The equilibrium at time t [s], from the state x (n_vert, 3) at time t0.
+
+    With contact, the solve goes in rounds: contacts are found at the state that the last round left, and their stencils
+    and normals are those of that state until the next. It has converged when a round begins with a residual that meets
+    the tolerance.
+    """
+    problem = method.problem
+    placed, targets = problem.constrain(x, t), problem.targets(t)
+    if toucher is None:
+        return run(method, placed, budget, monitor, before=x, targets=targets)
+    results: list[Result] = []
+    length, left, state = FIRST_ROUND * (budget.every or method.every), budget, placed
+    start, before, ahead = x, x, toucher.size  # at first anything may come to touch
+    for _ in range(ROUNDS):
+        contacts = toucher.find(start, state, t0, t, ahead=ahead)
+        part = replace(left, iterations=min(length, left.cap))
+        result = run(method, contacts.put_outside(state), part, monitor, before, targets, contacts, bool(results))
+        results.append(result)
+        left = _left(budget, results)
+        if not result.status.ok or (result.iterations == 0 and result.status is not Status.ITERATIONS):
+            break
+        if result.status is Status.ITERATIONS and left.cap == 0:
+            break
+        if result.status is Status.SECONDS:
+            break
+        was, state = state, np.asarray(result.x, float)
+        start, ahead = state, float(np.linalg.norm(state - was, axis=1).max())
+        t0, before, length = t, None, 2 * length
+    return joined(results, budget)
+
+
+def _left(budget: Budget, results: list[Result]) -> Budget:
+    """What rounds so far have left of a budget, its relative tolerance made absolute."""
+    tolerance = budget.tolerance(results[0].residuals[0])
+    seconds = None if budget.seconds is None else max(budget.seconds - sum(r.seconds for r in results), 0.0)
+    return replace(
+        budget,
+        iterations=budget.cap - sum(r.iterations for r in results),
+        seconds=seconds,
+        rtol=None,
+        atol=tolerance if tolerance >= 0 else None,
+    )
+
+
+def joined(results: list[Result], budget: Budget) -> Result:
+    """The results of successive rounds as one."""
+    last = results[-1]
+    if len(results) == 1:
+        return last
+    done = np.cumsum([0] + [r.iterations for r in results])
+    status = last.status
+    if status is Status.ITERATIONS and done[-1] < budget.cap:
+        status = Status.CONTACTS
+    return replace(
+        last,
+        status=status,
+        error=last.error if last.iterations else results[-2].error,
+        iterations=int(done[-1]),
+        residuals=np.concatenate([r.residuals for r in results]),
+        energies=np.concatenate([r.energies for r in results]),
+        monitored=np.concatenate([r.monitored + d for r, d in zip(results, done)]),
+        seconds=sum(r.seconds for r in results),
+        monitor_seconds=sum(r.monitor_seconds for r in results),
+    )
