@@ -59,6 +59,7 @@ class Toucher:
         self.detector = Detector(problem.contact, problem.X, problem.fixed)
         self.contacts = Contacts()
         self.size = float(np.linalg.norm(np.ptp(problem.X, axis=0)))
+        self.checked = False
         self.began()
 
     def began(self) -> None:
@@ -71,6 +72,10 @@ class Toucher:
     ) -> Contacts:
         """As :meth:`pbng.contact.detection.Detector.find`, timed."""
         start = time.perf_counter()
+        if not self.checked:
+            self.detector.check(x0)
+            self.checked = True
+        self.detector.borne = self.method.borne()
         self.contacts = self.detector.find(x0, x1, t0, t1, limited, ahead)
         self.seconds += time.perf_counter() - start
         return self.contacts

@@ -20,6 +20,7 @@ class BoxTree:
     Attributes:
         cells: The primitives, (m, k) int32, as given.
         group: The group of each, (m,) int32; their number is ``n_group``.
+        n_vert: One more than the highest vertex.
         order: The primitives in the order of the tree, (m,) int32; ``sorted_cells`` are their vertices in that order.
         nodes: (n, 4) int32: the first of two children, which follow each other, or -1; the range of primitives; the
             group, or -1 where there are several. Parents come before children, level by level.
@@ -37,6 +38,7 @@ class BoxTree:
         """
         x = np.ascontiguousarray(x, np.float64)
         self.cells = np.ascontiguousarray(cells, np.int32)
+        self.n_vert = int(self.cells.max(initial=-1)) + 1
         m = len(self.cells)
         self.group = np.zeros(m, np.int32) if group is None else np.ascontiguousarray(group, np.int32)
         self.n_group = int(self.group.max(initial=0)) + 1
@@ -58,14 +60,11 @@ class BoxTree:
         """Fit the boxes to positions x (n_vert, 3) [m], or to both x and y, widened by a margin [m] on every side."""
         x = np.ascontiguousarray(x, np.float64)
         y = x if y is None else np.ascontiguousarray(y, np.float64)
+        assert x.shape[1:] == y.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
+        assert min(len(x), len(y)) >= self.n_vert, "a vertex has no position"
         numbers = np.array([self.cells.shape[1], y is not x], np.int64)
         arrays = (self.nodes, self.boxes, self.sorted_cells.ravel(), x, y, numbers, np.array([margin], np.float64))
         run(_refit, arrays, np.arange(len(self._start) - 1)[::-1].copy(), self._start, GRAIN)
-
-    @property
-    def size(self) -> float:
-        """Diagonal of the box around all [m]; 0 if there is nothing."""
-        return float(np.linalg.norm(self.boxes[0, 3:] - self.boxes[0, :3])) if len(self.cells) else 0.0
 
 
 @body

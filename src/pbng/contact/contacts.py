@@ -40,6 +40,9 @@ class Contacts:
         vertex: Vertex of each half-space, (k,) int32.
         plane: Its normal, (k, 3).
         level: Its offset n·p of a point p on it [m], (k,).
+        friction: F [N], (k,).
+        anchor: Where the vertex would be now had it stuck to the collider [m], (k, 3).
+        creep: ε [m].
     """
 
     vertices: np.ndarray = field(default_factory=lambda: _none(CORNERS, dtype=np.int32))
@@ -52,6 +55,9 @@ class Contacts:
     vertex: np.ndarray = field(default_factory=lambda: _none(dtype=np.int32))
     plane: np.ndarray = field(default_factory=lambda: _none(3))
     level: np.ndarray = field(default_factory=_none)
+    friction: np.ndarray = field(default_factory=_none)
+    anchor: np.ndarray = field(default_factory=lambda: _none(3))
+    creep: float = 1.0
 
     def __len__(self) -> int:
         return len(self.vertices) + len(self.vertex)
@@ -89,6 +95,8 @@ class ContactEnergy:
         self.sticks = bool(c.k_tau.any())
         self.vertex, self.plane = slot[c.vertex], c.plane
         self.level = c.level - c.plane @ origin
+        self.friction, self.anchor, self.creep = c.friction, c.anchor - origin, c.creep
+        self.rubs = bool(c.friction.any())
 
     def energy(self, x: np.ndarray) -> float:
         """Energy [J] at x (n, 3)."""
@@ -96,6 +104,8 @@ class ContactEnergy:
         energy = 0.5 * float((self.k_n * depth * depth).sum())
         if self.sticks:
             energy += 0.5 * float((self.k_tau * (self._across(C) ** 2).sum(1)).sum())
+        if self.rubs:
+            energy += float((self.friction * (self._slid(x)[1] - self.creep)).sum())
         return energy
 
     def forces(self, x: np.ndarray) -> tuple[np.ndarray, float]:
@@ -104,7 +114,17 @@ class ContactEnergy:
         pull = (self.k_n * depth)[:, None] * self.normal
         if self.sticks:
             pull += self.k_tau[:, None] * self._across(C)
-        return -(self.spread @ pull), float((np.linalg.norm(pull, axis=1) * self.reach).sum())
+        f, scale = -(self.spread @ pull), float((np.linalg.norm(pull, axis=1) * self.reach).sum())
+        if self.rubs:
+            u, length = self._slid(x)
+            rub = -(self.friction / length)[:, None] * u
+            np.add.at(f, self.vertex, rub)
+            scale += float(np.linalg.norm(rub, axis=1).sum())
+        return f, scale
+
+    def borne(self, f: np.ndarray) -> np.ndarray:
+        """With what force [N] each half-space bears its vertex against forces f (n, 3), (k,)."""
+        return np.maximum(-(self.plane * f[self.vertex]).sum(1), 0.0)
 
     def balanced(self, f: np.ndarray, x: np.ndarray, tolerance: float) -> None:
         """Take from forces f (n, 3) at x (n, 3), in place, what half-spaces that are touched bear."""
@@ -157,6 +177,12 @@ class ContactEnergy:
         """C (m, 3), and min(gap, 0) (m,)."""
         C = self.weights @ x
         return C, np.minimum((self.normal * C).sum(1) - self.offset, 0.0)
+
+    def _slid(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far each vertex has slid along its half-space, (k, 3), and sqrt(|u|² + ε²)."""
+        u = x[self.vertex] - self.anchor
+        u = u - (self.plane * u).sum(1)[:, None] * self.plane
+        return u, np.sqrt((u * u).sum(1) + self.creep**2)
 
     def _across(self, C: np.ndarray) -> np.ndarray:
         return C - (self.normal * C).sum(1)[:, None] * self.normal

@@ -25,6 +25,7 @@ NEAR = 0.5  # radius, in mean lengths of the edges
 STIFF = 10.0  # default stiffness, in E h of the softer body
 PUSH = 0.1  # how much of the mean length of an edge a contact may push apart in one step of a motion
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
+CREEP = 1e-3  # of the margin: ways shorter than this do not count as sliding
 TOUCHING = 1e-9  # of the radius: closer points have no direction between them
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
 
@@ -200,11 +201,10 @@ class SurfaceDetector:
             kept=kept,
         )
 
-    def check_start(self, x: np.ndarray) -> None:
-        """InputError if a body lies wholly inside another: then no way out is the shortest."""
+    def check(self, x: np.ndarray) -> None:
+        """InputError if a body lies wholly inside another at x: no way out is then the shortest."""
         if self.tets is None or not self.several:
             return
-        self.tets.refit(x)
         inside = self._inside(np.ascontiguousarray(x, float), self.vertex, self.meets_others, None)
         body = self.body[self.vertex]
         for b in np.unique(body):
@@ -239,6 +239,15 @@ class Detector:
         self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
         self.free = spec.surface[~fixed[spec.surface]]
         self.seconds = Seconds()
+        self.borne = np.zeros((len(X), 3))  # with what force [N] colliders bear each vertex
+
+    def _last_borne(self, vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        return np.maximum((self.borne[vertex] * normal).sum(1), 0.0)
+
+    def check(self, x: np.ndarray) -> None:
+        """As :meth:`SurfaceDetector.check`."""
+        if self.surfaces:
+            self.surfaces.check(x)
 
     def find(
         self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, limited: bool = False, ahead: float = 0.0
@@ -254,12 +263,17 @@ class Detector:
         self.seconds.surfaces += now - clock
         touches = [c.touch(x0[self.free], x1[self.free], t0, t1, self.spec.margin + ahead) for c in self.spec.colliders]
         if touches:
-            normal = np.concatenate([t.normal for t in touches])
+            normal, slip = (np.concatenate([getattr(t, name) for t in touches]) for name in ("normal", "slip"))
+            vertex = self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32)
+            coefficient = np.repeat([c.friction for c in self.spec.colliders], [len(t.vertex) for t in touches])
             found = replace(
                 found,
-                vertex=self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32),
+                vertex=vertex,
                 plane=normal,
                 level=(normal * np.concatenate([t.point for t in touches])).sum(1),
+                friction=coefficient * self._last_borne(vertex, normal),
+                anchor=x0[vertex] + slip,
+                creep=CREEP * self.spec.margin,
             )
         self.seconds.colliders += time.perf_counter() - now
         return found

@@ -13,6 +13,7 @@ For the time of its contact a node is held in the static layout by a Hessian as 
 of its own, with colours of their own: contacts couple nodes that elements do not.
 """
 
+import math
 import time
 from dataclasses import replace
 from typing import Any
@@ -26,7 +27,7 @@ from pbng.contact.contacts import Contacts
 from pbng.dispatch import call, specialised
 from pbng.elements.base import AHEAD, W
 from pbng.jit import compile_seconds, inline
-from pbng.linalg import dot, scale, solve_spd
+from pbng.linalg import dot, scale, solve_spd, sub
 from pbng.packing import NODAL, Packed
 from pbng.parallel import array, body, rows, run, scratch
 from pbng.problem import Problem
@@ -34,7 +35,9 @@ from pbng.sweep import aligned_part
 
 HELD = 1e30  # diagonal of the Hessian of a node that is swept elsewhere: it does not move
 ROUNDS = 8  # of multipliers of a node with several contacts
-ROW = 11  # numbers of an incidence: own weight, sum of all, 3 others, normal, offset, compliance, tangential stiffness
+# Numbers of an incidence: own weight, sum of all, 3 others, normal, offset, compliance, tangential stiffness; friction
+# and its anchor.
+ROW = 15
 _1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(1, 12))
 
 
@@ -122,6 +125,8 @@ class ContactNodes:
         row[n:, 0] = row[n:, 1] = 1
         row[n:, 5:8] = c.plane[walls]
         row[n:, 8] = c.level[walls] - c.plane[walls] @ packed.origin
+        row[n:, 11] = c.friction[walls]
+        row[n:, 12:] = c.anchor[walls] - packed.origin
         other = np.zeros((len(own), 3), np.uint32)
         other[:n] = 4 * packed.slot[c.vertices[contact[:, None], rest]]
         other[n:] = (4 * packed.slot[c.vertex[walls]])[:, None]
@@ -136,7 +141,7 @@ class ContactNodes:
         at = np.repeat(first[lanes], count[lanes]) + _counting(count[lanes])
         taken = order[at]
         self.other, self.row = np.ascontiguousarray(other[taken]), np.ascontiguousarray(row[taken], dtype)
-        self.force = np.zeros(len(taken), dtype)
+        self.force, self.creep = np.zeros(len(taken), dtype), c.creep
 
     def sweep(self, x: np.ndarray, omega: float) -> None:
         """Update every node in contact once, in place."""
@@ -144,7 +149,7 @@ class ContactNodes:
             return
         p, r = self.packed, self.rows
         arrays = (
-            x, r.seg_start, r.seg, r.idx, r.coef, r.nodal, p.parameters, np.array([omega], p.dtype), self.place,
+            x, r.seg_start, r.seg, r.idx, r.coef, r.nodal, p.parameters, np.array([omega, self.creep], p.dtype), self.place,
             self.first, self.other, self.row, self.force,
         )  # fmt: skip
         blocks = specialised(make_contact_sweep, p.functions, p.dtype)
@@ -185,7 +190,7 @@ def make_contact_sweep(key: str, dtype: np.dtype) -> Any:
     def blocks(arguments, low, high):
         x, seg_start, seg = array(arguments, 0, real), array(arguments, 1, np.int64), rows(arguments, 2, 5, np.int64)
         idx, coef, nodal = array(arguments, 3, np.uint32), array(arguments, 4, real), array(arguments, 5, real)
-        par, omega = array(arguments, 6, real), array(arguments, 7, real)[0]
+        par, omega, creep = array(arguments, 6, real), array(arguments, 7, real)[0], array(arguments, 7, real)[1]
         place, first = array(arguments, 8, np.int64), array(arguments, 9, np.int64)
         other, row = rows(arguments, 10, 3, np.uint32), rows(arguments, 11, ROW, real)
         force = array(arguments, 12, real)
@@ -208,29 +213,33 @@ def make_contact_sweep(key: str, dtype: np.dtype) -> Any:
                 at = place[W * b + l_]
                 if at >= 0:
                     low_c, high_c = first[W * b + l_], first[W * b + l_ + 1]
-                    _step(uint64(at), x, acc, uint64(l_), omega, low_c, high_c, other, row, force)
+                    _step(uint64(at), x, acc, uint64(l_), omega, creep, low_c, high_c, other, row, force)
 
     return blocks
 
 
 @inline
-def _step(at, x, acc, l, omega, low, high, other, row, force):
+def _step(at, x, acc, l, omega, creep, low, high, other, row, force):
     """Solve the local problem of the node in lane l, whose position is at x[at], and move it."""
     real = type(omega)
     a0, a1, a2 = acc[_3 + l], acc[_4 + l], acc[_5 + l]
     a3, a4, a5 = acc[_6 + l], acc[_7 + l], acc[_8 + l]
     f0, f1, f2 = acc[l], acc[_1 + l], acc[_2 + l]
     for c in range(low, high):
-        k = row[c, 10]
-        if k > real(0):
-            # What sticks is an ordinary spring across the normal.
-            w = row[c, 0]
+        # What sticks or rubs is a spring across the normal; that of friction bounds its energy, as it is concave in u².
+        k, w, F = row[c, 10], row[c, 0], row[c, 11]
+        if k > real(0) or F > real(0):
             n = row[c, 5], row[c, 6], row[c, 7]
             C = _gap_vector(c, at, x, other, row)
+            if F > real(0):
+                C = C[0] - row[c, 12], C[1] - row[c, 13], C[2] - row[c, 14]
             along = dot(n, C)
-            f0 -= w * k * (C[0] - along * n[0])
-            f1 -= w * k * (C[1] - along * n[1])
-            f2 -= w * k * (C[2] - along * n[2])
+            u = sub(C, scale(along, n))
+            if F > real(0):
+                k = F / math.sqrt(dot(u, u) + creep * creep)
+            f0 -= w * k * u[0]
+            f1 -= w * k * u[1]
+            f2 -= w * k * u[2]
             s = w * w * k
             a0 += s * (real(1) - n[0] * n[0])
             a1 -= s * n[0] * n[1]

@@ -8,7 +8,7 @@ is not asked, a column of False is never found. ``excluded`` = (start, ids): for
 primitives that it never finds, as :func:`pbng.contact.rings.neighbourhoods` gives them; ``vertex`` (k,) tells which
 vertex a point is.
 
-Results are the same for any number of threads. Of primitives at just the same distance the lowest is found.
+Results are the same for any number of threads. Of primitives at the same distance, up to rounding, the lowest is found.
 """
 
 from math import sqrt
@@ -23,6 +23,7 @@ from pbng.parallel import array, body, each, rows, scratch
 
 GRAIN = 128  # queries that a thread takes at a time
 NONE = 1 << 31  # above every number
+ROUNDING = 1e-14  # distances that differ by less, relative to themselves or to the size of the tree, are the same
 Excluded = tuple[np.ndarray, np.ndarray]
 
 
@@ -52,10 +53,12 @@ def closest_triangles(
         Triangles (k,) int32, -1 for none; weights (k, 3) of the closest points; distances (k,) [m], infinite for none.
     """
     points = np.ascontiguousarray(points, np.float64)
+    assert points.shape[1:] == (3,), "points must have shape (k, 3)"
+    assert excluded is None or vertex is not None, "excluded needs vertex"
     k = len(points)
     found, weights, distance = np.empty(k, np.int32), np.empty((k, 3)), np.empty(k)
     arrays = (points, np.array([behind], np.int64), found, weights, distance)
-    each(_closest_triangles, (*_common(tree, x, k, reach, own, meets, vertex, excluded), *arrays), k, GRAIN)
+    each(_closest_triangles, (*_common(tree, 3, x, k, reach, own, meets, vertex, excluded), *arrays), k, GRAIN)
     return found, weights, distance
 
 
@@ -82,10 +85,12 @@ def closest_edges(
         Edges (k,) int32 of the tree, -1 for none; the closest points' parameters s (k,) along the edge that asks and
         t (k,) along the one found, from 0 at the first vertex to 1; distances (k,) [m], infinite for none.
     """
-    edges = _int32(edges).reshape(-1, 2)
+    edges = np.ascontiguousarray(edges, np.int32).reshape(-1, 2)
     k = len(edges)
+    assert edges.min(initial=0) >= 0, "an edge has no vertex"
+    assert edges.max(initial=-1) < len(x), "a vertex has no position"
     found, s, t, distance = np.empty(k, np.int32), np.empty(k), np.empty(k), np.empty(k)
-    common = _common(tree, x, k, reach, own, meets, None, excluded)
+    common = _common(tree, 2, x, k, reach, own, meets, None, excluded)
     each(_closest_edges, (*common, edges, found, s, t, distance), k, GRAIN)
     return found, s, t, distance
 
@@ -113,16 +118,19 @@ def containing_tets(
         Tets (k,) int32, -1 for none, and the weights (k, 4) of the points there, none negative.
     """
     points = np.ascontiguousarray(points, np.float64)
+    assert points.shape[1:] == (3,), "points must have shape (k, 3)"
+    assert excluded is None or vertex is not None, "excluded needs vertex"
     k = len(points)
     found, weights = np.empty(k, np.int32), np.empty((k, 4))
     numbers = np.array([vertex is not None], np.int64)
     arrays = (points, numbers, found, weights)
-    each(_containing_tets, (*_common(tree, x, k, 0.0, own, meets, vertex, excluded), *arrays), k, GRAIN)
+    each(_containing_tets, (*_common(tree, 4, x, k, 0.0, own, meets, vertex, excluded), *arrays), k, GRAIN)
     return found, weights
 
 
 def _common(
     tree: BoxTree,
+    corners: int,
     x: np.ndarray,
     k: int,
     reach: float | np.ndarray,
@@ -131,28 +139,35 @@ def _common(
     vertex: np.ndarray | None,
     excluded: Excluded | None,
 ) -> tuple[np.ndarray, ...]:
-    """The first 12 arguments of every body."""
+    """The first 12 arguments of every body; what does not fit is refused here, as bodies read without looking."""
+    assert tree.cells.shape[1] == corners, f"a tree over primitives of {corners} vertices is needed"
+    x = np.ascontiguousarray(x, np.float64)
+    assert x.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
+    assert len(x) >= tree.n_vert, "a vertex has no position"
     reaches = np.array(np.broadcast_to(np.asarray(reach, np.float64), (k,)))
-    if meets is None:
-        own, meets = None, np.ones((1, tree.n_group), bool)
-    elif own is None:
-        raise TypeError("meets needs own")
-    meets = np.ascontiguousarray(meets, np.bool_)
-    assert meets.shape[1] >= tree.n_group, "meets has no column for some group"
-    if own is not None:
-        reaches[~meets.any(1)[own]] = -1.0
+    assert (own is None) == (meets is None), "own and meets go together"
+    grouped = own is not None
+    meets = np.ones((1, tree.n_group), bool) if meets is None else np.ascontiguousarray(meets, np.bool_)
+    assert meets.shape[1] >= tree.n_group, "meets has no column for some group of the tree"
+    own = _numbers(own, k, len(meets))
+    if grouped:
+        reaches[~np.any(meets, axis=1)[own]] = -1.0
     start, ids = (np.zeros(1, np.int64), np.zeros(1, np.int32)) if excluded is None else excluded
-    sizes = np.array([own is not None, meets.shape[1], excluded is not None], np.int64)
-    zero = np.zeros(1, np.int32)
-    return (
-        tree.nodes, tree.boxes, tree.order, tree.sorted_cells, np.ascontiguousarray(x, np.float64), reaches,
-        sizes, meets, zero if own is None else _int32(own), zero if vertex is None else _int32(vertex),
-        np.ascontiguousarray(start, np.int64), _int32(ids),
-    )  # fmt: skip
+    vertex = _numbers(vertex, k, NONE if excluded is None else len(start) - 1)
+    sizes = np.array([grouped, meets.shape[1], excluded is not None], np.int64)
+    start, ids = np.ascontiguousarray(start, np.int64), np.ascontiguousarray(ids, np.int32)
+    return tree.nodes, tree.boxes, tree.order, tree.sorted_cells, x, reaches, sizes, meets, own, vertex, start, ids
 
 
-def _int32(a: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(a, np.int32)
+def _numbers(a: np.ndarray | None, k: int, end: int) -> np.ndarray:
+    """One number a query, below ``end``; a placeholder for none."""
+    if a is None:
+        return np.zeros(1, np.int32)
+    a = np.ascontiguousarray(a, np.int32)
+    assert a.shape == (k,), f"one number a query is needed, {(k,)}, not {a.shape}"
+    assert a.min(initial=0) >= 0, "a number is negative"
+    assert a.max(initial=-1) < end, "a number is too high"
+    return a
 
 
 @inline
@@ -172,14 +187,15 @@ def _gap2(boxes, i, low, high):
 @inline
 def _slack(boxes):
     """A distance above the rounding errors of distances to what is in the tree [m]."""
-    return 1e-15 * (abs(boxes[0, 3] - boxes[0, 0]) + abs(boxes[0, 4] - boxes[0, 1]) + abs(boxes[0, 5] - boxes[0, 2]))
+    return ROUNDING * (abs(boxes[0, 3] - boxes[0, 0]) + abs(boxes[0, 4] - boxes[0, 1]) + abs(boxes[0, 5] - boxes[0, 2]))
 
 
 @inline
-def _bound(best, slack):
-    """Squared distance from which on boxes hold nothing as close as ``best``, squared, rounding included."""
-    r = sqrt(best) * (1.0 + 1e-14) + slack
-    return r * r
+def _same(d2, slack):
+    """Between which squared distances another one is taken for the same as ``d2``."""
+    d = sqrt(d2)
+    least, most = max(d * (1.0 - ROUNDING) - slack, 0.0), d * (1.0 + ROUNDING) + slack
+    return least * least, most * most
 
 
 @inline
@@ -216,20 +232,20 @@ def _closest_triangles(arguments, low, high):
             continue
         p = _point(points, q)
         row = own[q] * n_group if grouped else 0
-        best, closest = reach[q] * reach[q], NONE
+        limit, closest = reach[q] * reach[q], NONE  # beyond nothing is found
         u = v = w = 0.0
-        bound = _bound(best, slack)
+        best = least = most = limit
         top, i = 0, 0
         gap = _gap2(boxes, 0, p, p)
         while True:
-            if gap <= bound and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
+            if gap <= most and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
                 child = nodes[i, 0]
                 if child >= 0:
                     near, far = _gap2(boxes, child, p, p), _gap2(boxes, child + 1, p, p)
                     i, child = child, child + 1
                     if far < near:
                         i, child, near, far = child, i, far, near
-                    if far <= bound:
+                    if far <= most:
                         stack[top], gaps[top] = child, far
                         top += 1
                     gap = near
@@ -238,7 +254,7 @@ def _closest_triangles(arguments, low, high):
                     a, b, c = _point(x, cells[e, 0]), _point(x, cells[e, 1]), _point(x, cells[e, 2])
                     weight, offset, d2 = closest_on_triangle(p, a, b, c)
                     t = order[e]
-                    if not d2 <= best or (d2 == best and t >= closest):  # not a number is not found
+                    if not d2 <= most or d2 > limit or (d2 >= least and t > closest):  # not a number is not found
                         continue
                     if behind and not dot(offset, cross(sub(b, a), sub(c, a))) > 0.0:
                         continue
@@ -246,7 +262,7 @@ def _closest_triangles(arguments, low, high):
                         continue
                     best, closest = d2, t
                     u, v, w = weight
-                    bound = _bound(best, slack)
+                    least, most = _same(best, slack)
             if top == 0:
                 break
             top -= 1
@@ -278,20 +294,20 @@ def _closest_edges(arguments, low, high):
         lowest = min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2])
         highest = max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2])
         row = own[q] * n_group if grouped else 0
-        best, closest = reach[q] * reach[q], NONE
+        limit, closest = reach[q] * reach[q], NONE  # beyond nothing is found
         along, across = 0.0, 0.0
-        bound = _bound(best, slack)
+        best = least = most = limit
         top, i = 0, 0
         gap = _gap2(boxes, 0, lowest, highest)
         while True:
-            if gap <= bound and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
+            if gap <= most and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
                 child = nodes[i, 0]
                 if child >= 0:
                     near, far = _gap2(boxes, child, lowest, highest), _gap2(boxes, child + 1, lowest, highest)
                     i, child = child, child + 1
                     if far < near:
                         i, child, near, far = child, i, far, near
-                    if far <= bound:
+                    if far <= most:
                         stack[top], gaps[top] = child, far
                         top += 1
                     gap = near
@@ -302,12 +318,12 @@ def _closest_edges(arguments, low, high):
                         continue
                     s1, t1, _, d2 = closest_segments(a, b, _point(x, c), _point(x, d))
                     edge = order[e]
-                    if not d2 <= best or (d2 == best and edge >= closest):
+                    if not d2 <= most or d2 > limit or (d2 >= least and edge > closest):
                         continue
                     if listed and (_is_listed(start, ids, v, edge) or _is_listed(start, ids, w, edge)):
                         continue
                     best, closest, along, across = d2, edge, s1, t1
-                    bound = _bound(best, slack)
+                    least, most = _same(best, slack)
             if top == 0:
                 break
             top -= 1

@@ -7,7 +7,7 @@ from pbng.topology import incidence
 
 
 def neighbourhoods(cells: np.ndarray, n_vert: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """The cells within some rings of each vertex: the first are those that have it, the next those that touch these, ...
+    """The cells within some rings of each vertex: those that have it are one ring, those that touch these the next.
 
     Args:
         cells: Edges, triangles or tets, (m, k).

@@ -237,6 +237,15 @@ class PackedMethod:
             self.touching.balanced(self._places(f), self._places(x), self.slack(x))
         return f, force_scale, inverted
 
+    def borne(self) -> np.ndarray:
+        """With what force [N] colliders bear each vertex at the state last certified, (n_vert, 3)."""
+        out = np.zeros((self.problem.n_vert, 3))
+        if self.touching:
+            f = self.forces + self.f_ext
+            force = self.touching.borne(self._places(f)) * self.touching.held(self._places(self.x), self.slack(self.x))
+            np.add.at(out, self.contacts.vertex, force[:, None] * self.contacts.plane)
+        return out
+
     def slack(self, x: np.ndarray) -> float:
         """How far from a half-space a vertex may be that touches it [m]: roundings."""
         return 4 * self.rounding(x)
