@@ -12,7 +12,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-app = typer.Typer(help="Measure: time of a sweep, convergence, accuracy, cycles, poses, frames.", no_args_is_help=True)
+app = typer.Typer(
+    help="Measure: time of a sweep, convergence, accuracy, cycles, poses, frames, contact.", no_args_is_help=True
+)
 console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 170)  # tables are wide
 
 
@@ -247,6 +249,38 @@ def poses_command(
         [total],
     )
     write(record, "poses", [total | {"each": rows}])
+
+
+@app.command("contact")
+def contact_command(
+    n: Annotated[int, typer.Option("--n", help="Vertices across the body: 46 for 24,300 triangles.", min=2)] = 46,
+    points: Annotated[int, typer.Option(help="Points close to its surface.", min=1)] = 100_000,
+    tets: Annotated[int, typer.Option("--tets", help="Vertices across each of six solid balls; 0 for none.")] = 27,
+    threads: Annotated[list[int], typer.Option(help="Numbers of threads.")] = [1, 2],  # noqa: B006
+    rounds: int = 7,
+    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+) -> None:
+    """Time trees and closest points for contact, in one run with libigl if it is there."""
+    from pbng.bench import contact
+
+    rows = contact.measure(n, points, tets, threads, rounds)
+    show(
+        f"Queries for contact, median of {rounds} rounds; libigl does not choose its threads",
+        [
+            Column("query", "query"),
+            Column("primitives", "primitives", "{:,}"),
+            Column("points", "points", "{:,}"),
+            Column("threads", "threads"),
+            Column("build [ms]", "build_ms", "{:.1f}"),
+            Column("refit [ms]", "refit_ms", "{:.2f}"),
+            Column("M points/s", "near", "{:.2f}"),
+            Column("within 20 mm", "cut", "{:.2f}"),
+            Column("libigl, M points/s", "igl", "{:.2f}"),
+            Column("ratio", "ratio", "{:.1f}"),
+        ],
+        rows,
+    )
+    write(record, "contact", rows)
 
 
 @dataclass(frozen=True)

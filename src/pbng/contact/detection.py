@@ -60,6 +60,7 @@ class SurfaceDetector:
         self.body[s.triangles] = s.body[:, None]
         self.edges = unique_edges(s.triangles, TRIANGLE_EDGES)
         edge_body = self.body[self.edges[:, 0]]
+        self.beside = _beside(s.triangles, self.edges)
         self.triangles = BoxTree(X, s.triangles, s.body)
         self.edge_tree = BoxTree(X, self.edges, edge_body)
         self.tets = BoxTree(X, s.tets, s.tet_body) if len(s.tets) else None
@@ -158,22 +159,18 @@ class SurfaceDetector:
         second = (1 - t)[:, None] * x[e[theirs, 0]] + t[:, None] * x[e[theirs, 1]]
         across = np.cross(x[e[mine, 1]] - x[e[mine, 0]], x[e[theirs, 1]] - x[e[theirs, 0]])
         bodies = np.column_stack([body[mine], body[theirs]])
-        normals = self._edge_normals(x)
+        mine_out, theirs_out = self._edge_normals(x, mine), self._edge_normals(x, theirs)
         # Solids that overlap here have each its edge inside the other.
         apart = first - second
-        overlap = ((apart * normals[theirs]).sum(1) < 0) & ((apart * normals[mine]).sum(1) > 0)
+        overlap = ((apart * theirs_out).sum(1) < 0) & ((apart * mine_out).sum(1) > 0)
         inside = self.solid[bodies].all(1) & overlap
-        outward = np.where(((across * normals[theirs]).sum(1) < 0)[:, None], -across, across)
+        outward = np.where(((across * theirs_out).sum(1) < 0)[:, None], -across, across)
         return _Pairs(stencil, weights, first, second, outward, inside, bodies)
 
-    def _edge_normals(self, x: np.ndarray) -> np.ndarray:
-        """Sum of the normals at each edge's ends, (n_edge, 3)."""
-        a, b, c = x[self.surfaces.triangles].transpose(1, 0, 2)
-        n = np.cross(b - a, c - a)
-        total = np.zeros_like(x)
-        for k in range(3):
-            np.add.at(total, self.surfaces.triangles[:, k], n)
-        return total[self.edges].sum(1)
+    def _edge_normals(self, x: np.ndarray, edge: np.ndarray) -> np.ndarray:
+        """Sum of the area vectors of the triangles at edges, (k, 3)."""
+        corners = x[self.surfaces.triangles[self.beside[edge]]]
+        return np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]).sum(1)
 
     def _contacts(self, pairs: list[_Pairs], limited: bool) -> Contacts:
         s = self.surfaces
@@ -215,6 +212,16 @@ class SurfaceDetector:
                     f"contact: body {names[b]!r} starts fully inside body {names[solids[0]]!r} ({count[0]} vertices);"
                     " move one of them"
                 )
+
+
+def _beside(triangles: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """The two triangles at each edge, (n_edge, 2); twice the same where there is one."""
+    key = edges[:, 0].astype(np.int64) << 32 | edges[:, 1]
+    pairs = np.sort(triangles[:, TRIANGLE_EDGES].reshape(-1, 2).astype(np.int64), axis=1)
+    edge = np.searchsorted(key, pairs[:, 0] << 32 | pairs[:, 1])
+    order = np.argsort(edge, kind="stable")
+    first, last = (np.searchsorted(edge[order], np.arange(len(edges)), side) for side in ("left", "right"))
+    return order[np.column_stack([first, last - 1])] // 3
 
 
 @dataclass
