@@ -18,9 +18,9 @@ def main(folder=None):
     bar = pbng.shapes.box(size=(1.8, 0.5, 0.5), vertices=(15, 5, 5))
 
     scene = pbng.Scene(gravity=(0.0, -9.8, 0.0))
-    left = scene.add(block, flesh, "left")
-    right = scene.add(block, flesh, "right", at=(2.5, 0.0, 0.0))
-    muscle = scene.add(bar, flesh, "muscle", at=(0.6, 0.25, 0.25))
+    left = scene.add(block, flesh, name="left")
+    right = scene.add(block, flesh, name="right", at=(2.5, 0.0, 0.0))
+    muscle = scene.add(bar, flesh, name="muscle", at=(0.6, 0.25, 0.25))
     walls = left.where(x=0.0), right.where(x=3.0)
     for wall in walls:
         scene.pin(wall)

@@ -22,7 +22,7 @@ import pbng
 
 def scene(resolution=3):
     scene = pbng.Scene()
-    block = scene.add(pbng.shapes.box((1.0, 1.0, 1.0), resolution), pbng.Corotated(E=1e5, nu=0.3), "block")
+    block = scene.add(pbng.shapes.box((1.0, 1.0, 1.0), resolution), pbng.Corotated(E=1e5, nu=0.3), name="block")
     scene.pin(block.where(x=0.0))
     scene.move(block.where(x=1.0), pbng.Translate((0.1, 0.0, 0.0)), over=0.1)
     return scene

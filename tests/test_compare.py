@@ -64,7 +64,7 @@ class FakeMethod:
     def prepare(self, before, x):
         self.solver.clock.now += 0.25
 
-    def start(self, x, targets=None):
+    def start(self, x, targets=None, contacts=None, resume=False):
         self.solver.clock.now += 0.25
         self.x, self.targets, self.k = x.copy(), targets, 0
 

@@ -156,7 +156,7 @@ def test_bodies_bound_by_stiff_springs_move_together(solver):
     upper, lower = scene.add(box, RUBBER, at=(0, 1, 0)), scene.add(box, RUBBER, at=(0.1, 0, 0.1))
     scene.pin(upper.where(y=2.0))
     scene.bind(lower.where(y=1.0), upper, k=1e8)
-    budget = pbng.Budget(rtol=1e-9, atol=1e-6, iterations=300)
+    budget = pbng.Budget(atol=1e-5, iterations=600)
     *_, last = pbng.simulate(scene, solver, budget, frames=4, fps=20, inertia=True)
     assert last.result.status is pbng.Status.CONVERGED
     assert np.linalg.norm(last.springs[:, 0] - last.springs[:, 1], axis=1).max() < 1e-4  # 0.1 at rest, at two edges

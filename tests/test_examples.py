@@ -21,6 +21,7 @@ COURSE = [
     ("09_labels_to_trust", 1.0, 0.0, [], []),  # all of them
     ("10_springs", 1.0, 0.01, [], []),
     ("11_motion", 1.0, 1e-3, [], []),
+    ("12_cloth", 1.0, 5e-3, [], []),
 ]
 
 

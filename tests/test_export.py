@@ -1,11 +1,13 @@
 """Other programs get the bits of the run, in files that other readers read."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fake_runs import box, frames, sheet
 
+import pbng
 from pbng.errors import InputError
 from pbng.io.export import FORMATS, drawn, export
 from pbng.io.frames import FrameWriter, Run
@@ -144,3 +146,25 @@ def test_no_half_written_file_is_left(run, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="frame_000002"):
         export(run, tmp_path / "out", "pc2")
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["out.obj"]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_colliders_are_further_bodies_if_wanted(tmp_path, format):
+    if format.startswith("vt"):
+        pytest.importorskip("pyvista")
+    ball = pbng.Sphere((0, 0, 0), 0.4, motion=pbng.Translate((0, -1, 0)), over=0.1)
+    with FrameWriter(tmp_path / "run") as out:
+        for frame in frames([sheet(4, 0.5)], 2, dtype=np.float64, fps=10):
+            frame.problem.contact = SimpleNamespace(colliders=(pbng.Plane((0, -2, 0), (0, 1, 0), name="floor"), ball))
+            out.write(frame)
+    plain = export(tmp_path / "run", tmp_path / "plain", format)
+    full = export(tmp_path / "run", tmp_path / "full", format, colliders=True)
+    assert len(plain) == len(full)
+    split = export(tmp_path / "run", tmp_path / "split", format, split=True, colliders=True)
+    assert len(split) == 3 * len(plain)
+    if format == "obj":
+        (points, faces), alone = read_obj(full[-1]), read_obj(plain[-1])
+        assert len(points) == len(alone[0]) + 4 + len(ball.surface()[0])
+        assert len(faces) == len(alone[1]) + 2 + len(ball.surface()[1])
+        assert np.array_equal(points[-len(ball.surface()[0]) :], ball.surface(0.1)[0])
+        assert {file.name for file in split} >= {"split_floor_0000.obj", "split_Sphere_0001.obj"}

@@ -15,7 +15,7 @@ from fake_runs import Body, Problem, Status, box, frames, sheet
 import pbng
 from pbng.errors import InputError
 from pbng.io import store
-from pbng.io.frames import FrameWriter, Run, read_run
+from pbng.io.frames import FrameWriter, Run, StoredContact, read_run
 from pbng.mesh import Embedding, TetMesh
 
 
@@ -275,3 +275,74 @@ def test_velocities_and_springs_are_kept(tmp_path):
     np.testing.assert_array_equal(last.v, frame.v)
     np.testing.assert_allclose(last.springs[:, 0], frame.x[body.where(x=0.0).index])
     np.testing.assert_allclose(last.springs[:, 1], np.tile([0.0, 2, 0], (9, 1)), atol=1e-12)
+
+
+def press(moving=True):
+    """A ball between a floor and a plane that comes down, beside a mesh that turns."""
+    scene = pbng.Scene(gravity=(0, -9.8, 0))
+    scene.add(pbng.shapes.sphere(0.5, 5, (0, 0.5, 0)), pbng.Corotated(E=2e3, nu=0.3, density=10.0), name="ball")
+    options = {"motion": pbng.Translate((0, -0.2, 0)), "over": 0.2} if moving else {}
+    paddle = pbng.shapes.box((0.2, 0.2, 0.2), 2, (1.0, 0.0, 0.0))
+    scene.collide_with(
+        [
+            pbng.Plane((0, 0, 0), (0, 1, 0)),
+            pbng.Plane((0, 1, 0), (0, -1, 0), name="press", **options),
+            pbng.Kinematic(paddle, motion=pbng.Rotate("y", 0.1) if moving else None, over=0.2),
+        ]
+    )
+    return list(pbng.simulate(scene, pbng.PBNG(), pbng.Budget(iterations=20), frames=3, fps=10, inertia=True))
+
+
+def test_contact_and_colliders_come_back(tmp_path):
+    made = press()
+    with FrameWriter(tmp_path / "run") as out:
+        for frame in made:
+            out.write(frame)
+    run = Run(tmp_path / "run")
+    assert [(c.name, c.kind, c.moves) for c in run.colliders] == [
+        ("Plane", "Plane", False),
+        ("press", "Plane", True),
+        ("Kinematic", "Kinematic", True),
+    ]
+    colliders = made[0].problem.contact.colliders
+    assert len(made[-1].contact.vertices) > 0
+    for frame, back in zip(made, run, strict=True):
+        for name in StoredContact.__dataclass_fields__:
+            assert np.array_equal(getattr(back.contact, name), getattr(frame.contact, name)), name
+        for collider, shape, points in zip(colliders, run.colliders, back.colliders, strict=True):
+            expected, triangles = collider.surface(frame.t)
+            assert np.array_equal(points, expected.astype(points.dtype))
+            assert points.dtype == (frame.x.dtype if shape.moves else float)
+            assert np.array_equal(shape.mesh.cells, triangles)
+    assert np.array_equal(run.colliders[1].mesh.X[:, 1], np.ones(4)), "at rest"
+    assert np.allclose(run[-1].colliders[1][:, 1], 0.8)
+    assert "collider_000" not in np.load(tmp_path / "run" / "frame_000001.npz"), "what rests is stored once"
+    with pytest.raises(InputError, match="its colliders are not those"):
+        FrameWriter(tmp_path / "run", append=True).write(press(moving=False)[0])
+    FrameWriter(tmp_path / "run", append=True).write(made[-1])
+    assert len(Run(tmp_path / "run")) == 4
+
+
+def test_runs_from_before_there_was_contact_are_read(tmp_path):
+    write(tmp_path / "run")
+    file = tmp_path / "run" / "run.json"
+    manifest = json.loads(file.read_text())
+    del manifest["colliders"]
+    file.write_text(json.dumps(manifest))
+    run = Run(tmp_path / "run")
+    assert run.colliders == ()
+    assert run[0].contact is None
+    assert run[0].colliders == ()
+
+
+def test_colliders_of_a_run_that_is_replaced_go_with_it(tmp_path):
+    with FrameWriter(tmp_path / "run") as out:
+        out.write(press(moving=False)[0])
+    write(tmp_path / "run", overwrite=True)
+    assert not list((tmp_path / "run").glob("collider_*"))
+    (tmp_path / "run" / "body_000.npz").unlink()
+    with FrameWriter(tmp_path / "run", overwrite=True) as out:
+        out.write(press(moving=False)[0])
+    (tmp_path / "run" / "collider_001.npz").unlink()
+    with pytest.raises(InputError, match=r"incomplete run: .*collider_001\.npz is missing"):
+        Run(tmp_path / "run")

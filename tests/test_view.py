@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 from fake_runs import box, frames, sheet, twisted
+from pictures import SIZE, assert_well_framed, body_pixels, drawn, read
 
 from pbng.errors import InputError
 from pbng.io.frames import FrameWriter, Run
@@ -17,13 +18,10 @@ from pbng.view.surface import Motion, Surface, creased
 
 pytest.importorskip("pyvista")
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
-Image = pytest.importorskip("PIL.Image")
 
 from pbng import view as views  # noqa: E402
 from pbng.view import colors, render, shadow, springs  # noqa: E402
 from pbng.view.occlusion import occlude  # noqa: E402
-
-SIZE = (320, 180)
 
 
 def drawn_out(X, s):
@@ -37,27 +35,6 @@ def run(tmp_path_factory):
         for frame in frames([box((6, 6, 6)), box((4, 4, 4), at=(2.5, 0, 0))], 5, drawn_out):
             out.write(frame)
     return Run(path)
-
-
-def read(path):
-    return np.asarray(Image.open(path).convert("RGB")).astype(int)
-
-
-def body_pixels(image):
-    """Pixels of saturated colour: the background, the floor and shadows are grey."""
-    return np.ptp(image, axis=2) > 30
-
-
-def assert_well_framed(image, size, least=0.08, most=0.75):
-    assert image.shape == (size[1], size[0], 3)
-    body = body_pixels(image)
-    assert least < body.mean() < most
-    edge = max(2, size[1] // 40)
-    inner = np.zeros_like(body)
-    inner[edge:-edge, edge:-edge] = True
-    assert not body[~inner].any(), "a body is cropped"
-    assert image[body].sum(1).min() > 90, "a face is black"
-    assert (image[:edge] > 235).all(), "the background is light"
 
 
 def test_boxes_are_cut_along_their_edges_only():
@@ -336,10 +313,6 @@ def two_boxes(gap, lines=None):
 def green(image):
     """Pixels that springs cover for a good part; no body here is green, blues and greys are not."""
     return image[..., 1] - image[..., [0, 2]].max(2) > 25
-
-
-def drawn(source, tmp_path, size=(480, 480), **options):
-    return read(views.picture(source, tmp_path / "a.png", size=size, color="body", **options))
 
 
 def test_springs_are_seen_between_what_they_tie(tmp_path):

@@ -2,16 +2,20 @@
 
 from . import gallery as gallery, linalg as linalg, shapes as shapes, view as view
 from .bodies import Body as Body, Points as Points, Selection as Selection
+from .contact.colliders import Box as Box, Capsule as Capsule, Plane as Plane, Sphere as Sphere, container as container
+from .contact.kinematic import Kinematic as Kinematic
 from .drivers import Frame as Frame, default_solver as default_solver, simulate as simulate, solve as solve
 from .errors import InputError as InputError
 from .io.export import export as export
 from .io.frames import FrameWriter as FrameWriter, read_run as read_run
 from .io.meshes import read_mesh as read_mesh, read_surface as read_surface
 from .materials.base import Block as Block, ConstraintForm as ConstraintForm, Material as Material, material as material
+from .materials.bending import Bending as Bending
 from .materials.check import check_material as check_material
 from .materials.corotated import Corotated as Corotated
 from .materials.invariants import InvariantMaterial as InvariantMaterial
 from .materials.linear import LinearElastic as LinearElastic
+from .materials.membrane import Membrane as Membrane
 from .materials.neo_hookean import NeoHookean as NeoHookean
 from .materials.stable_neo_hookean import StableNeoHookean as StableNeoHookean
 from .mesh import Embedding as Embedding, TetMesh as TetMesh, TriMesh as TriMesh

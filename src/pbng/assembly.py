@@ -53,7 +53,8 @@ class ElementBlocks:
             rows[:, 3] = np.minimum(W, n - np.arange(n_block) * W)
             blocks.append(rows)
             at += n_block * W * corners
-        self.idx, self.blocks = np.concatenate(idx), np.concatenate(blocks)
+        self.idx = np.concatenate([np.empty(0, np.uint32), *idx])
+        self.blocks = np.concatenate([np.empty((0, 4), np.int64), *blocks])
         self._all = np.arange(-(-len(self.blocks) // CHUNK))
 
     def energy(self, x: np.ndarray) -> float:

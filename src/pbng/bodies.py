@@ -42,7 +42,7 @@ class Body:
             raise InputError(
                 f"{who}: a solid in two dimensions must lie in a plane of constant z; for cloth take Membrane"
             )
-        if surface:
+        if surface and isinstance(self.mesh, TriMesh):
             try:
                 self.mesh.hinges  # noqa: B018
             except InputError as error:
@@ -74,8 +74,9 @@ class Body:
     @property
     def faces(self) -> np.ndarray:
         """What bounds it, of cloth all of it: triangles (k, 3), or in the plane edges (k, 2), by its own vertices."""
-        plane = isinstance(self.mesh, TriMesh) and not self.is_cloth
-        return self.mesh.boundary_edges if plane else self.mesh.surface
+        if isinstance(self.mesh, TriMesh) and not self.is_cloth:
+            return self.mesh.boundary_edges
+        return self.mesh.surface
 
 
 @dataclass(frozen=True, eq=False)

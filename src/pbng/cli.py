@@ -214,9 +214,10 @@ def info(
 def view(
     path: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")],
     to: Annotated[Path | None, typer.Option("--out", help="Folder for the pictures; by default RUN_view.")] = None,
+    color: Annotated[str, typer.Option("--color", help="stretch, body, contact or the name of a colour.")] = "stretch",
 ) -> None:
     """Draw a run: its last frame, a strip, a film and its residuals."""
-    _draw(path, to)
+    _draw(path, to, color)
 
 
 @app.command()
@@ -225,11 +226,12 @@ def export(
     format: Annotated[str, typer.Option("--format", "-f", help="vtu, vtp, obj, ply or pc2.")] = "vtu",
     to: Annotated[Path | None, typer.Option("--out", help="Folder for the files; by default RUN_FORMAT.")] = None,
     split: Annotated[bool, typer.Option("--split", help="Each body into files of its own.")] = False,
+    colliders: Annotated[bool, typer.Option("--colliders", help="Colliders too, as further bodies.")] = False,
 ) -> None:
     """Write a run in the format of another program (ParaView, Blender, Houdini)."""
     from pbng.io.export import export
 
-    files = export(path, to or path.parent / f"{path.name}_{format}", format, split=split)
+    files = export(path, to or path.parent / f"{path.name}_{format}", format, split=split, colliders=colliders)
     out.print(f"wrote {len(files)} files to {escape(str(files[-1].parent))}", soft_wrap=True)
     out.print(f"[dim]open:[/] {escape(str(files[-1]))}", soft_wrap=True)
 
@@ -249,10 +251,10 @@ def bench(context: typer.Context) -> None:
     benchmarks(args=context.args, prog_name="pbng bench", standalone_mode=False)
 
 
-def _draw(path: Path, to: Path | None) -> None:
+def _draw(path: Path, to: Path | None, color: str = "stretch") -> None:
     from pbng.view import view
 
-    wrote(view(path, to))
+    wrote(view(path, to, color))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pbng.cli_console import FAILED, INTERRUPTED, blaming, err, out, table
 from pbng.drivers import Frame, simulate
+from pbng.equilibrium import ContactReport
 from pbng.errors import InputError
 from pbng.gallery.recipe import Recipe
 from pbng.io.frames import FrameWriter
@@ -28,13 +29,16 @@ SWINGING = 1.0  # how long [s] to look on after the last motion has ended, where
 
 @dataclass(eq=False)
 class Report:
-    """What a run came to: the result of each frame (without its positions), and why it stopped if before the end."""
+    """What a run came to: the result of each frame (without its positions), what touched in it where anything may, and
+    why it stopped if before the end.
+    """
 
     path: Path
     problem: Problem
     frames: int
     fps: float
     results: list[Result] = field(default_factory=list)
+    contacts: list[ContactReport] = field(default_factory=list)
     last: Frame | None = None
     written: int = 0
     stopped: str = ""
@@ -102,6 +106,8 @@ def _write(coming: Iterator[Any], writer: FrameWriter, watch: "_Watch", report: 
                 return
             writer.write(frame)
             report.results.append(replace(frame.result, x=np.empty((0, 3))))  # they are on the disk
+            if frame.contact is not None:
+                report.contacts.append(replace(frame.contact, vertices=np.empty(0, int)))
             report.last = frame
             watch.done(frame)
     except KeyboardInterrupt:
@@ -153,10 +159,11 @@ class _Bar(_Watch):
         super().__init__(label, frames)
         self.budget, self.bar = budget, bar
         self.task = bar.add_task(label, total=frames, detail=f"1/{frames}")
+        self.touching = ""
 
     def monitor(self, now: base.Progress) -> None:
         ratio = now.residual / now.first if now.first > 0 else 0.0
-        detail = f"{self.k + 1}/{self.frames} · {now.iteration:>4} iterations · ratio {ratio:.0e}"
+        detail = f"{self.k + 1}/{self.frames} · {now.iteration:>4} iterations · ratio {ratio:.0e}{self.touching}"
         self.bar.update(self.task, completed=self.k + self._share(now), detail=detail)
 
     def _share(self, now: base.Progress) -> float:
@@ -170,6 +177,8 @@ class _Bar(_Watch):
 
     def done(self, frame: Any) -> None:
         self.k += 1
+        if frame.contact is not None:
+            self.touching = f" · contacts {frame.contact.pairs + frame.contact.walls:,}"
         self.bar.update(self.task, completed=self.k)
 
 
@@ -233,9 +242,24 @@ def _rows(report: Report, results: list[Result], compiled: float) -> Iterator[tu
     yield "inverted elements", f"{results[-1].inverted:,} at the end, at most {max(r.inverted for r in results):,}"
     yield "solving", f"{seconds:.2f} s, {1e3 * seconds / max(iterations, 1):.2f} ms an iteration"
     yield "set-up, compiling", f"{setup_seconds:.2f} s, {compiled:.2f} s"
+    yield from _contact_rows(report.contacts)
     memory = _peak_memory()
     if memory is not None:
         yield "memory", f"{memory / 2**20:,.0f} MiB at most"
+
+
+def _contact_rows(contacts: list[ContactReport]) -> Iterator[tuple[str, str]]:
+    if not contacts:
+        return
+    last, deepest = contacts[-1], max(contacts, key=lambda c: c.deepest)
+    yield "contacts of bodies", f"{last.pairs:,} at the end, at most {max(c.pairs for c in contacts):,}"
+    yield "contacts with colliders", f"{last.walls:,} at the end, at most {max(c.walls for c in contacts):,}"
+    if deepest.deepest > 0:
+        share = deepest.deepest / deepest.size
+        yield "penetration", f"at most {deepest.deepest:.1e} m, {share:.1e} of the scene's size"
+    total = sum(c.seconds for c in contacts) or 1.0
+    finding, packing = sum(c.detect_seconds for c in contacts), sum(c.pack_seconds for c in contacts)
+    yield "finding contacts, packing", f"{finding / total:.1%}, {packing / total:.1%} of the time"
 
 
 def _peak_memory() -> float | None:

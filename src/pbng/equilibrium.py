@@ -8,9 +8,11 @@ import numpy as np
 
 from pbng.contact.contacts import Contacts
 from pbng.contact.detection import Detector
+from pbng.errors import InputError
 from pbng.problem import Problem
 from pbng.solvers.base import Budget, Method, Monitor, Result, Solver, Status
 from pbng.solvers.loop import run
+from pbng.solvers.pbng import PackedMethod
 
 ROUNDS = 40  # in which contacts are found anew
 FIRST_ROUND = 2  # length of the first, in evaluations of the residual; each further one may be twice as long
@@ -55,6 +57,8 @@ class Toucher:
 
     def __init__(self, problem: Problem, method: Method) -> None:
         assert problem.contact is not None
+        if not isinstance(method, PackedMethod):
+            raise InputError(f"scene {problem.name!r}: contact needs PBNG or MultigridPBNG")
         self.problem, self.method = problem, method
         self.detector = Detector(problem.contact, problem.X, problem.fixed)
         self.contacts = Contacts()
@@ -163,7 +167,8 @@ def equilibrium(
         return run(method, placed, budget, monitor, before=x, targets=targets)
     results: list[Result] = []
     length, left, state = FIRST_ROUND * (budget.every or method.every), budget, placed
-    start, before, ahead = x, x, toucher.size  # at first anything may come to touch
+    start, ahead = x, toucher.size  # at first anything may come to touch
+    before: np.ndarray | None = x
     for _ in range(ROUNDS):
         contacts = toucher.find(start, state, t0, t, ahead=ahead)
         part = replace(left, iterations=min(length, left.cap))

@@ -69,9 +69,10 @@ class Groups:
             for g, p, block in zip(elements, first, blocks):
                 kind, model = g.term
                 if compounds:
-                    self._add(compound.sweep(kind, model), p, kind.corners, compound.WIDTH, block)
+                    self._add(compound.sweep(kind, model), p, kind.corners, compound.width(kind), block)
                 else:
-                    self._add(kind.sweep(model), p, kind.others, kind.width(model.isotropic), block)
+                    sweep = kind.paper_sweep(model) if paper_block else kind.sweep(model)
+                    self._add(sweep, p, kind.others, kind.width(model.isotropic), block)
             for w in weakly:
                 others = w.corners - (not compounds) + w.anchored
                 parameters.append(others)

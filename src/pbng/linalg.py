@@ -221,6 +221,31 @@ def rotation(F):
 
 
 @leaf
+def _half_tangent(t):
+    """tan(φ/2) from t = tan φ, for φ in [0, π/2]."""
+    real = type(t)
+    return t / (real(1) + math.sqrt(real(1) + t * t))
+
+
+@leaf
+def arctan2(y, x):
+    """The angle of the point (x, y) [rad], as ``math.atan2``, to rounding; 0 at the origin, and without a branch.
+
+    The tangent of the angle to the nearer axis is at most 1; halved three times it is at most tan(π/32), where eight
+    terms of the series do in float64.
+    """
+    real = type(y)
+    u, v = abs(x), abs(y)
+    t = _half_tangent(_half_tangent(_half_tangent(min(u, v) / max(max(u, v), real(1e-37)))))
+    q = t * t
+    s = real(1 / 9) + q * (real(-1 / 11) + q * (real(1 / 13) - q * real(1 / 15)))
+    a = real(8) * t * (real(1) + q * (real(-1 / 3) + q * (real(1 / 5) + q * (real(-1 / 7) + q * s))))
+    a = real(math.pi / 2) - a if v > u else a
+    a = real(math.pi) - a if x < real(0) else a
+    return -a if y < real(0) else a
+
+
+@leaf
 def solve_spd(a00, a01, a02, a11, a12, a22, b0, b1, b2):
     """Solution of the symmetric positive definite 3x3 system with the given upper triangle, by A = L D Lᵀ.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from pbng.errors import InputError
 from pbng.jit import serial
-from pbng.topology import TET_EDGES, TRIANGLE_EDGES, components, tet_faces, unique_edges
+from pbng.topology import TET_EDGES, TRIANGLE_EDGES, components, hinges, tet_faces, unique_edges
 
 log = logging.getLogger("pbng")
 
@@ -279,6 +279,25 @@ class TriMesh(Mesh):
         pairs = np.sort(self.cells[:, TRIANGLE_EDGES].reshape(-1, 2), axis=1)
         edges, count = np.unique(pairs, axis=0, return_counts=True)
         return edges[count == 1]
+
+    @cached_property
+    def hinges(self) -> np.ndarray:
+        """Hinges (m, 4) int32, one for each edge between two triangles: its ends, then the third vertices of the two.
+
+        Raises:
+            InputError: An edge belongs to more than two triangles, or two neighbours are not oriented alike.
+        """
+        found, code, bad = hinges(self.cells)
+        if code:
+            shared = sorted(set.intersection(*(set(self.cells[e].tolist()) for e in bad)))
+            what = ", ".join(str(e) for e in bad)
+            raise InputError(
+                {
+                    1: f"edge {shared} belongs to {len(bad)} triangles: {what}; a surface has at most two at an edge",
+                    2: f"triangles {what} are not oriented alike: both run the same way along their edge {shared}",
+                }[code]
+            )
+        return _frozen(found)
 
     @property
     def is_plane(self) -> bool:

@@ -166,8 +166,8 @@ class Layout:
                     _fill(family, span, self.problem.X, owner, real, places, self.groups, idx, coef, nodal)
             stiffness.append((nodal[:n_block, 3] + nodal[:n_block, 6] + nodal[:n_block, 8]).ravel() / 3)
         seg_start, seg = spans[0] if len(spans) == 1 else _merge(spans)
-        nodal = _padded(nodal, real).astype(self.dtype).ravel()
-        return Rows(seg_start, seg[:, :5].copy(), idx, coef, nodal, stiffness[0], stiffness[1] - stiffness[0])
+        constant = _padded(nodal, real).astype(self.dtype).ravel()
+        return Rows(seg_start, seg[:, :5].copy(), idx, coef, constant, stiffness[0], stiffness[1] - stiffness[0])
 
 
 class Rows(NamedTuple):

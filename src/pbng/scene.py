@@ -49,6 +49,7 @@ class Scene:
         self.name = name
         self.gravity = _vector("gravity", gravity)
         self.bodies: list[Body] = []
+        self._waits: list[float] = []  # of each body
         self._moves: list[_Move] = []
         self._forces: list[tuple[np.ndarray, np.ndarray]] = []
         self._bindings: list[Binding] = []
@@ -62,6 +63,7 @@ class Scene:
         bending: Bending | None = None,
         name: str | None = None,
         at: Any = None,
+        wait: float = 0.0,
     ) -> Body:
         """Add a body.
 
@@ -72,6 +74,7 @@ class Scene:
             bending: How cloth resists bending; by default not at all.
             name: Unique; by default numbered.
             at: Translation [m] of the mesh, (3,).
+            wait: Time [s] until which all of it is held where it is, but for what moves.
 
         Raises:
             InputError: The name is taken, groups are unknown, overlap or leave cells out, triangles of a solid are not
@@ -85,8 +88,11 @@ class Scene:
         if at is not None:
             mesh = _translated(mesh, np.array(_vector(f"body {name!r}: at", at)))
         start = sum(b.mesh.n_vert for b in self.bodies)
+        if not (math.isfinite(wait) and wait >= 0):
+            raise InputError(f"body {name!r}: wait must be finite and not negative, not {wait}")
         body = Body(name, mesh, _materials(name, mesh, material), start, bending)
         self.bodies.append(body)
+        self._waits.append(wait)
         return body
 
     def pin(self, selection: Selection, until: float = math.inf) -> None:
@@ -295,7 +301,8 @@ class Scene:
         for b in self.bodies:
             if isinstance(b.mesh, TriMesh) and not b.is_cloth:
                 f_ext[b.start : b.start + b.mesh.n_vert, 2] = 0  # plane strain: z never moves
-        prescribed = _Prescribed(X, [m for m in self._moves if m.until > at])
+        moves = self._moves_at(at)
+        prescribed = _Prescribed(X, moves)
         fixed = np.zeros(len(X), bool)
         fixed[prescribed.index] = True
         weak = weak_constraints(self._bindings)
@@ -310,14 +317,30 @@ class Scene:
             prescribed=prescribed,
             f_ext=f_ext,
             mass=mass,
-            end=max([prescribed.end, *(c.end for c in self.colliders), *(b.targets.end for b in self._bindings if isinstance(b.targets, _Prescribed))]),
+            end=max(
+                [
+                    prescribed.end,
+                    *(c.end for c in self.colliders),
+                    *(b.targets.end for b in self._bindings if isinstance(b.targets, _Prescribed)),
+                ]
+            ),
             weak=weak,
             contact=contact_spec(self.bodies, self._contact, self.colliders),
-            until=min((m.until for m in self._moves if m.until > at), default=math.inf),
+            until=min((m.until for m in moves), default=math.inf),
         )
         if not free:
             self._warn_of_loose_parts(problem)
         return problem
+
+    def _moves_at(self, t: float) -> list[_Move]:
+        """The pins and moves that hold at time t [s], and pins of the rest of the bodies that wait."""
+        moves = [m for m in self._moves if m.until > t]
+        taken = np.concatenate([np.empty(0, int), *(m.index for m in moves)])
+        for body, wait in zip(self.bodies, self._waits):
+            index = np.setdiff1d(np.arange(body.start, body.start + body.mesh.n_vert), taken)
+            if wait > t and len(index):
+                moves.append(_Move(index, None, 0.0, 0.0, wait))
+        return moves
 
     def _warn_of_loose_parts(self, problem: Problem) -> None:
         held = np.zeros(problem.component.max() + 1, int)

@@ -90,15 +90,39 @@ def rectangle(
     size: Sequence[float] = (1.0, 1.0), vertices: Sequence[int] | int = 16, origin: Sequence[float] = (0.0, 0.0)
 ) -> TriMesh:
     """A plane rectangle in z = 0 [m], two triangles a cell, their diagonals alternating."""
-    n = _counts("rectangle", vertices, 2)
-    axes = [o + np.linspace(0, s, m) for o, s, m in zip(_point("origin", origin, 2), _sizes("rectangle", size, 2), n)]
+    return TriMesh(*_two_triangles("rectangle", size, vertices, origin))
+
+
+def sheet(
+    size: Sequence[float] = (1.0, 1.0),
+    vertices: Sequence[int] | int = 16,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+) -> TriMesh:
+    """A level sheet, for cloth: a rectangle along x and z, its normal up, two triangles a cell, diagonals alternating.
+
+    Args:
+        size: Edge lengths along x and z [m].
+        vertices: Vertices along each, at least 2.
+        origin: The corner of least x and z [m].
+    """
+    flat, cells = _two_triangles("sheet", size, vertices, (0.0, 0.0))
+    X = np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]]) + _point("origin", origin, 3)
+    return TriMesh(X, cells[:, [0, 2, 1]])
+
+
+def _two_triangles(
+    what: str, size: Sequence[float], vertices: Sequence[int] | int, origin: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 2) and triangles (m, 3) of a grid, counter-clockwise."""
+    n = _counts(what, vertices, 2)
+    axes = [o + np.linspace(0, s, m) for o, s, m in zip(_point("origin", origin, 2), _sizes(what, size, 2), n)]
     X = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     i, j = (a.ravel() for a in np.meshgrid(*(np.arange(m - 1, dtype=np.int32) for m in n), indexing="ij"))
     a, b, c, d = i * n[1] + j, (i + 1) * n[1] + j, (i + 1) * n[1] + j + 1, i * n[1] + j + 1
     even = ((i + j) % 2 == 0)[:, None, None]
     one = np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1)
     other = np.stack([np.stack([a, b, d], 1), np.stack([b, c, d], 1)], 1)
-    return TriMesh(X, np.where(even, one, other).reshape(-1, 3))
+    return X, np.where(even, one, other).reshape(-1, 3)
 
 
 def _sizes(what: str, sizes: Sequence[float], n: int) -> tuple[float, ...]:

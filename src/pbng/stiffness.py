@@ -16,6 +16,7 @@ from pbng.assembly import CHUNK, ElementBlocks
 from pbng.constraints import WeakEnergy
 from pbng.dispatch import call, specialised
 from pbng.elements.base import W, gather
+from pbng.elements.cloth_stiffness import ClothStiffness
 from pbng.elements.simplex import PLANE_TRIANGLE, TET
 from pbng.elements.stiffness import (
     FULL,
@@ -107,13 +108,16 @@ class StiffnessMatrix(ElementBlocks):
         self.color_start = np.concatenate([[0], np.cumsum(np.bincount(problem.color[self.vertex]))])
         self.slot = np.empty(problem.n_vert, np.int64)
         self.slot[order] = np.arange(problem.n_vert)
-        super().__init__(problem.groups, problem.X, self.slot)
+        solids = [g for g in problem.groups if g.kind.solid]
+        super().__init__(solids, problem.X, self.slot)
         for term in self.terms:
             check_kind(term.kind)
         # The first number of a group is a block's, which is of no use here: the floor takes its place.
-        self.floor_at = np.cumsum([0] + [1 + len(g.material.parameters()) for g in problem.groups])[:-1]
-        self.scale = np.array([g.material.block().a for g in problem.groups])
+        self.floor_at = np.cumsum([0] + [1 + len(g.material.parameters()) for g in solids])[:-1]
+        self.scale = np.array([g.material.block().a for g in solids])
         self.matrix, self.constant = self._pattern(problem)
+        self.cloth = [ClothStiffness(g, problem.X) for g in problem.groups if not g.kind.solid]
+        self.cloth_place = [self._numbers(c.cells) for c in self.cloth]
 
     def _pattern(self, problem: Problem) -> tuple[BlockMatrix, np.ndarray | None]:
         """The matrix, still empty, and the constant values of weak constraints; sets where elements' blocks go."""
@@ -135,7 +139,7 @@ class StiffnessMatrix(ElementBlocks):
         graph = scipy.sparse.csr_matrix((ones, (row[free], column[free])), (n, n))
         graph.sum_duplicates()
         matrix = BlockMatrix(graph.indptr.astype(np.int64), graph.indices.astype(np.int32))
-        corners = np.array([t.kind.corners for t in self.terms])[self.blocks[:, 0]]
+        corners = np.array([t.kind.corners for t in self.terms], np.int64)[self.blocks[:, 0]]
         self.place_at = np.concatenate([[0], np.cumsum(W * corners**2)])
         self.place = np.empty(self.place_at[-1], np.int32)
         _places(self.blocks, corners, self.idx, self.place_at, matrix.start, matrix.column, self.place)
@@ -148,6 +152,15 @@ class StiffnessMatrix(ElementBlocks):
         constant[np.searchsorted(key, row[free] * n + weak.indices[free])] = weak.data[free].reshape(-1, 9)
         return matrix, constant
 
+    def _numbers(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (n,) of the blocks that cells (m, k) add to, and of the (m k k) pairs of corners that do."""
+        n, k = len(self.vertex), cells.shape[1]
+        rows = self.slot[cells]
+        row, column = np.repeat(rows, k, axis=1).ravel(), np.tile(rows, (1, k)).ravel()
+        free = np.flatnonzero((row < n) & (column < n))
+        key = np.repeat(np.arange(n), np.diff(self.matrix.start)) * n + self.matrix.column
+        return np.searchsorted(key, row[free] * n + column[free]), free
+
     def fill(self, x: np.ndarray, projection: str = "none", floor: float = FLOOR) -> None:
         """Set the matrix to the Hessian at x (n_vert, 3) [m].
 
@@ -159,18 +172,25 @@ class StiffnessMatrix(ElementBlocks):
         """
         if projection not in PROJECTIONS:
             raise InputError(f"projection must be one of {', '.join(PROJECTIONS)}, not {projection!r}")
+        value = self.matrix.value
+        value[:] = 0.0 if self.constant is None else self.constant
+        for cloth, (number, free) in zip(self.cloth, self.cloth_place):
+            np.add.at(value, number, cloth.evaluate(x, projection, floor).reshape(-1, 9)[free])
+        if self.terms:
+            self._fill_solids(x, projection, floor)
+
+    def _fill_solids(self, x: np.ndarray, projection: str, floor: float) -> None:
         self.parameters[self.floor_at] = floor * self.scale
         flat = np.zeros((self.n_slot, 4))
         flat[self.slot, :3] = x
-        value = self.matrix.value
-        value[:] = 0.0 if self.constant is None else self.constant
         # For each term: how (an isotropic projection is spectral), whether it is plane, and where its body is.
         spectral = [projection != "none" and t.model.isotropic for t in self.terms]
         how = [SPECTRAL_WAY if s else FULL_WAY if projection == "none" else PROJECTED_WAY for s in spectral]
         terms = np.array([[h, t.kind.plane, address(change_of_stress(t.model))] for h, t in zip(how, self.terms)])
         sizes = np.array([len(self.blocks), projection == "abs"], np.int64)
         order, start = self._disjoint
-        arrays = (flat, self.X, self.blocks, self.idx, self.parameters, order, self.place, self.place_at, value)
+        where, value = (order, self.place, self.place_at), self.matrix.value
+        arrays = (flat, self.X, self.blocks, self.idx, self.parameters, *where, value)
         fill = specialised(make_fill, (TET._element(), PLANE_TRIANGLE._element()))
         run(fill, (*arrays, sizes, terms, FULL, SPECTRAL), np.arange(len(start) - 1), start)
 

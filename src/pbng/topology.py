@@ -143,3 +143,25 @@ def _root(parent, v):
         parent[v] = parent[parent[v]]
         v = parent[v]
     return v
+
+
+def hinges(triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
+    """Pairs of triangles that share an edge, as hinges.
+
+    Returns the hinges (m, 4) int32, in order of their edges: the ends of the edge as they follow upon each other in the
+    first triangle, its third vertex, and that of the second; and the first bad edge as a code with its triangles: 1 for
+    an edge of more than two triangles, 2 for two that run along it the same way, 0 for none.
+    """
+    ends = triangles[:, TRIANGLE_EDGES].reshape(-1, 2).astype(np.int64)
+    key = ends.min(1) << 32 | ends.max(1)
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) != 0]))
+    count = np.diff(np.append(first, len(order)))
+    many = np.flatnonzero(count > 2)
+    if len(many):
+        return np.empty((0, 4), np.int32), 1, order[first[many[0]] :][: count[many[0]]] // 3
+    one, two = order[first[count == 2]], order[first[count == 2] + 1]
+    same = np.flatnonzero(ends[one, 0] == ends[two, 0])
+    bad = np.array([one[same[:1]], two[same[:1]]]).ravel() // 3
+    wings = (triangles[k // 3, (k % 3 + 2) % 3] for k in (one, two))
+    return np.column_stack([ends[one], *wings]).astype(np.int32), 2 if len(same) else 0, bad

@@ -101,14 +101,15 @@ class CoarseSpace:
 
     def touch(self, touching: ContactEnergy | None, x: np.ndarray, slack: float) -> None:
         """Take what resists at positions x (n, 3) of contacts and of half-spaces touched to within ``slack`` [m]."""
-        active = touching.active(x, slack) if touching else None
-        key = b"" if touching is None else touching.name + active.tobytes()
+        key, total = b"", self.tied
+        if touching is not None:
+            active = touching.active(x, slack)
+            key = touching.name + active.tobytes()
         if key == self.touched:
             return
         self.touched = key
-        total = self.tied
-        if active is not None and active.any():
-            found = touching.hessian(active, self.bearing, self.up)
+        if touching is not None and active.any():
+            found = touching.hessian(x, active, self.bearing, self.up)
             total = found if total is None else (total + found).tobsr((3, 3))
         self.solver.add(total)
 

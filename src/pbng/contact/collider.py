@@ -31,13 +31,11 @@ class Touches(NamedTuple):
         vertex: Which point, (j,) int64, rising; none appears twice.
         point: A point of the bounding plane at the end of the step [m], (j, 3): on the surface, plus the thickness.
         normal: Unit normals at the end of the step, away from the collider, (j, 3).
-        slip: How far the collider's material at the contact moves during the step [m], (j, 3).
     """
 
     vertex: np.ndarray
     point: np.ndarray
     normal: np.ndarray
-    slip: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -99,6 +97,10 @@ class Collider(ABC):
     def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Signed distance, closest point and outward normal for points (k, 3) in the body's frame."""
 
+    def _clearance(self, X: np.ndarray) -> np.ndarray:
+        """Signed distance alone."""
+        return self._near(X)[0]
+
     @abstractmethod
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         """Points and outward triangles of the surface at rest."""
@@ -145,12 +147,18 @@ class Collider(ABC):
         before, after = np.asarray(before, float), np.asarray(after, float)
         margin = np.broadcast_to(np.asarray(reach, float), len(before)) + self.thickness
         poses = self._poses(t0, t1)
+        every = np.arange(len(before))
+        if poses[0] is poses[-1]:  # at rest: most points are too far away, and quickly told
+            d = self._clearance(to_body(poses[0], before))
+            every = np.flatnonzero(d <= margin + norms(after - before))
+            before, after, margin = before[every], after[every], margin[every]
         path = [to_body(p, (1 - f) * before + f * after) for f, p in zip(np.linspace(0, 1, len(poses)), poses)]
-        left = path[0] if len(poses) == 2 and poses[0] is poses[1] else to_body(poses[-1], before)
+        left = path[0] if poses[0] is poses[-1] else to_body(poses[-1], before)
         length = np.sum([norms(b - a) for a, b in pairwise(path)], axis=0)
         d = self._near(path[0])[0]
-        index = np.flatnonzero(d <= margin + np.maximum(length, norms(left - path[0])))  # the others are too far away
-        path, left, d, length, margin = [p[index] for p in path], left[index], d[index], length[index], margin[index]
+        near = d <= margin + np.maximum(length, norms(left - path[0]))
+        index = every[near]
+        path, left, d, length, margin = [p[near] for p in path], left[near], d[near], length[near], margin[near]
 
         d1, point, normal = self._near(path[-1])
         chosen = (d1 < margin) | (d < margin) | (self._near(left)[0] < margin)
@@ -162,16 +170,18 @@ class Collider(ABC):
             point[open_[hit]], normal[open_[hit]] = where[hit], direction[hit]
             chosen[open_[hit]] = True
             open_ = open_[~hit]
-        return self._touches(index, chosen | inside, point, normal, poses[0], poses[-1])
+        return self._touches(index, chosen | inside, point, normal, poses[-1])
 
     def _touches(
-        self, index: np.ndarray, chosen: np.ndarray, X: np.ndarray, N: np.ndarray, first: Pose | None, last: Pose | None
+        self, index: np.ndarray, chosen: np.ndarray, X: np.ndarray, N: np.ndarray, pose: Pose | None
     ) -> Touches:
         """The contacts at points X with normals N of the body's frame."""
-        X, N = X[chosen], N[chosen]
-        x, n = to_world(last, X), turned(last, N)
-        slip = np.zeros_like(x) if first is last else x - to_world(first, X)
-        return Touches(index[chosen], x + self.thickness * n, n, slip)
+        n = turned(pose, N[chosen])
+        return Touches(index[chosen], to_world(pose, X[chosen]) + self.thickness * n, n)
+
+    def carried(self, points: np.ndarray, t0: float, t1: float) -> np.ndarray:
+        """How far the collider's material at points (k, 3) at time t1 has moved since t0 [m], (k, 3)."""
+        return points - to_world(self._pose(t0), to_body(self._pose(t1), points))
 
     def _sweep(self, start: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which straight paths (k, 3) that begin outside meet the surface, and where with what normal they first do.

@@ -43,9 +43,12 @@ class Plane(Collider):
         return np.array(self.point)
 
     def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        n = np.array(self.normal)
-        d = (X - self._center) @ n
+        n, d = np.array(self.normal), self._clearance(X)
         return d, X - d[:, None] * n, np.tile(n, (len(X), 1))
+
+    def _clearance(self, X: np.ndarray) -> np.ndarray:
+        n = np.array(self.normal)
+        return X @ n - self._center @ n
 
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         (u, v), (a, b) = _across(np.array(self.normal)), np.asarray(self.size) / 2

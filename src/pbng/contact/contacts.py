@@ -156,10 +156,13 @@ class ContactEnergy:
         """Which contacts resist at x, and which half-spaces are touched to within a tolerance [m], (m + k,) bool."""
         return np.concatenate([self._gaps(x)[1] < 0, self.held(x, tolerance)])
 
-    def hessian(self, active: np.ndarray, bearing: np.ndarray, U: scipy.sparse.csr_matrix) -> scipy.sparse.bsr_matrix:
-        """UᵀHU [N/m] in blocks of 3x3 for interpolation weights U (k, l) of the first k positions.
+    def hessian(
+        self, x: np.ndarray, active: np.ndarray, bearing: np.ndarray, U: scipy.sparse.csr_matrix
+    ) -> scipy.sparse.bsr_matrix:
+        """UᵀHU [N/m] in blocks of 3x3 at x for interpolation weights U (k, l) of the first k positions.
 
-        ``active`` says what resists; half-spaces count as springs of stiffness ``bearing`` (k,) [N/m] of their vertices.
+        ``active`` says what resists; half-spaces count as springs of stiffness ``bearing`` (k,) [N/m], and so does what
+        sticks to them.
         """
         m, k = len(self.k_n), U.shape[0]
         unit = np.eye(3)
@@ -168,7 +171,9 @@ class ContactEnergy:
         used = np.flatnonzero(active[:m] | (self.k_tau > 0))
         held = np.flatnonzero(active[m:])
         p, v = self.plane[held], self.vertex[held]
-        walls = bearing[v][:, None, None] * (p[:, :, None] * p[:, None])
+        across = p[:, :, None] * p[:, None]
+        sticks = np.minimum(self.friction / self._slid(x)[1], bearing[self.vertex])[held]
+        walls = bearing[v][:, None, None] * across + sticks[:, None, None] * (unit - across)
         at = scipy.sparse.csr_matrix((np.ones(len(v)), (np.arange(len(v)), v)), (len(v), k))
         W = scipy.sparse.vstack([self.weights[used][:, :k], at]).tocsr() @ U
         return stencil_hessian(W, np.concatenate([K[used], walls]))

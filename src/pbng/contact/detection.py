@@ -8,12 +8,13 @@ in one step it does not pass by the pair that it was found with.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from pbng.contact.bvh import BoxTree
+from pbng.contact.collider import Touches
 from pbng.contact.contacts import Contacts
 from pbng.contact.queries import closest_edges, closest_triangles, containing_tets
 from pbng.contact.rings import neighbourhoods
@@ -41,6 +42,10 @@ class _Pairs:
     outward: np.ndarray
     inside: np.ndarray
     bodies: np.ndarray
+
+    def some(self, which: np.ndarray) -> "_Pairs":
+        """Those pairs alone."""
+        return _Pairs(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
 class SurfaceDetector:
@@ -74,6 +79,8 @@ class SurfaceDetector:
         self.radius = s.radius if s.radius is not None else NEAR * float(s.spacing[present].mean())
         self.solid = np.zeros(n_body, bool)
         self.solid[np.unique(s.tet_body)] = True
+        # Of each vertex, whether it was inside a solid of others, and of its own; at first nobody knows.
+        self.were_inside = [np.ones(len(self.vertex), bool), np.ones(len(self.vertex), bool)]
 
     def find(self, x0: np.ndarray, x1: np.ndarray, limited: bool, ahead: float) -> Contacts:
         """Contacts of a step from x0 to, it is expected, x1 (n_vert, 3), give or take ``ahead`` [m].
@@ -89,58 +96,76 @@ class SurfaceDetector:
         self.triangles.refit(x0)
         pairs = []
         if self.several:
-            pairs += self._vertex_triangle(x0, reach, self.meets_others, None)
+            pairs.append(self._vertex_triangle(x0, reach, self.meets_others, None))
         if self.any_own:
-            pairs += self._vertex_triangle(x0, reach, self.meets_itself, self.near_triangles)
+            pairs.append(self._vertex_triangle(x0, reach, self.meets_itself, self.near_triangles))
         self.edge_tree.refit(x0)
         edge_reach = reach[self.edges].max(1)
-        if self.several:
-            pairs.append(self._edge_edge(x0, edge_reach, self.meets_others, None))
+        if self.several:  # each pair of bodies from one side: vertices look from both
+            pairs.append(self._edge_edge(x0, edge_reach, np.triu(self.meets_others), None))
         if self.any_own:
             pairs.append(self._edge_edge(x0, edge_reach, self.meets_itself, self.near_edges))
         return self._contacts(pairs, limited)
 
-    def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Any) -> list[_Pairs]:
+    def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Any) -> _Pairs:
         s, vertex = self.surfaces, self.vertex
         own = self.body[vertex]
-        points = x[vertex]
         asked: dict[str, Any] = {"own": own, "meets": meets, "vertex": vertex, "excluded": excluded}
-        triangle, weights, distance = closest_triangles(self.triangles, x, points, reach[vertex], **asked)
-        inside = self._inside(x, vertex, meets, excluded)
+        triangle, weights, _ = closest_triangles(self.triangles, x, x[vertex], reach[vertex], **asked)
+        inside, through = self._inside(x, triangle, weights, meets, excluded)
+        triangle[through] = -1
         deep = np.flatnonzero(inside >= 0)
         if len(deep):
             # What is inside a solid leaves it by the closest of its triangles that it is behind.
-            only = np.zeros((len(vertex), len(s.names)), bool)
-            only[np.arange(len(vertex)), np.maximum(inside, 0)] = True
-            part = only[deep]
-            t, w, d = closest_triangles(
-                self.triangles, x, points[deep], own=np.arange(len(deep), dtype=np.int32), meets=part,
-                vertex=vertex[deep], excluded=excluded, behind=True,
-            )  # fmt: skip
-            triangle[deep], weights[deep], distance[deep] = t, w, d
+            only = inside[deep, None] == np.arange(len(s.names))
+            v = vertex[deep]
+            triangle[deep], weights[deep], _ = closest_triangles(
+                self.triangles, x, x[v], own=np.arange(len(deep)), meets=only, vertex=v, excluded=excluded, behind=True
+            )
         found = np.flatnonzero(triangle >= 0)
-        corners = s.triangles[triangle[found]]
-        closest = np.einsum("kj,kji->ki", weights[found], x[corners])
-        a, b, c = x[corners].transpose(1, 0, 2)
-        stencil = np.column_stack([vertex[found], corners]).astype(np.int32)
-        signed = np.column_stack([np.ones(len(found)), -weights[found]])
-        bodies = np.column_stack([own[found], s.body[triangle[found]]])
-        outward = np.cross(b - a, c - a)
-        return [_Pairs(stencil, signed, points[found], closest, outward, inside[found] >= 0, bodies)]
-
-    def _inside(self, x: np.ndarray, vertex: np.ndarray, meets: np.ndarray, excluded: Any) -> np.ndarray:
-        """The solid that each vertex is inside of, -1 for none."""
-        out = np.full(len(vertex), -1, np.int64)
-        if self.tets is None or not (meets & self.solid).any():
-            return out
-        self.tets.refit(x)
-        near = None if excluded is None else self.near_tets
-        tet, _ = containing_tets(
-            self.tets, x, x[vertex], vertex, own=self.body[vertex], meets=meets & self.solid, excluded=near
+        v, corners = vertex[found], s.triangles[triangle[found]]
+        return _Pairs(
+            vertices=np.column_stack([v, corners]).astype(np.int32),
+            weights=np.column_stack([np.ones(len(found)), -weights[found]]),
+            first=x[v],
+            second=np.einsum("kj,kji->ki", weights[found], x[corners]),
+            outward=_area_vectors(x, corners),
+            inside=inside[found] >= 0,
+            bodies=np.column_stack([own[found], s.body[triangle[found]]]),
         )
-        found = tet >= 0
-        out[found] = self.surfaces.tet_body[tet[found]]
-        return out
+
+    def _inside(
+        self, x: np.ndarray, triangle: np.ndarray, weights: np.ndarray, meets: np.ndarray, excluded: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The solid that each vertex is inside of, -1 for none, and which see their triangle through the own body.
+
+        ``triangle`` and ``weights`` tell the closest point. Where that is within a triangle of another body, its normal
+        tells. Elsewhere it may not, and tets are looked for, as they are where a vertex was inside before; what goes in
+        is seen near the surface first.
+        """
+        s, vertex, own = self.surfaces, self.vertex, excluded is not None
+        out, through = np.full(len(vertex), -1, np.int64), np.zeros(len(vertex), bool)
+        if self.tets is None or not (meets & self.solid).any():
+            return out, through
+        found = np.flatnonzero(triangle >= 0)
+        corners, body = s.triangles[triangle[found]], s.body[triangle[found]]
+        way = x[vertex[found]] - np.einsum("kj,kji->ki", weights[found], x[corners])
+        behind = ((_area_vectors(x, corners) * way).sum(1) < 0) & self.solid[body]
+        plain = (weights[found].min(1) > SIDE) & (not own)
+        out[found[plain & behind]] = body[plain & behind]
+        asked = self.were_inside[own].copy()
+        asked[found[plain]] = False
+        asked[found[~plain & behind]] = True
+        q = np.flatnonzero(asked)
+        if len(q):
+            self.tets.refit(x)
+            v, near = vertex[q], self.near_tets if own else None
+            tet, _ = containing_tets(self.tets, x, x[v], v, own=self.body[v], meets=meets & self.solid, excluded=near)
+            out[q[tet >= 0]] = s.tet_body[tet[tet >= 0]]
+        self.were_inside[own] = out >= 0
+        if own:
+            through[found[behind]] = out[found[behind]] < 0
+        return out, through
 
     def _edge_edge(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Any) -> _Pairs:
         e = self.edges
@@ -160,23 +185,24 @@ class SurfaceDetector:
         across = np.cross(x[e[mine, 1]] - x[e[mine, 0]], x[e[theirs, 1]] - x[e[theirs, 0]])
         bodies = np.column_stack([body[mine], body[theirs]])
         mine_out, theirs_out = self._edge_normals(x, mine), self._edge_normals(x, theirs)
-        # Solids that overlap here have each its edge inside the other.
-        apart = first - second
-        overlap = ((apart * theirs_out).sum(1) < 0) & ((apart * mine_out).sum(1) > 0)
-        inside = self.solid[bodies].all(1) & overlap
+        ahead, back = (normals * (first - second) for normals in (theirs_out, mine_out))
+        ahead, back = ahead.sum(1), back.sum(1)
+        solid = self.solid[bodies].all(1)
+        # Two solids overlap where each has its edge inside the other; two edges of one see each other through it.
+        inside = solid & (ahead < 0) & (back > 0)
         outward = np.where(((across * theirs_out).sum(1) < 0)[:, None], -across, across)
-        return _Pairs(stencil, weights, first, second, outward, inside, bodies)
+        pairs = _Pairs(stencil, weights, first, second, outward, inside, bodies)
+        return pairs if excluded is None else pairs.some(~solid | ((ahead > 0) & (back < 0)))
 
     def _edge_normals(self, x: np.ndarray, edge: np.ndarray) -> np.ndarray:
         """Sum of the area vectors of the triangles at edges, (k, 3)."""
-        corners = x[self.surfaces.triangles[self.beside[edge]]]
-        return np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]).sum(1)
+        a, b = self.beside[edge].T
+        return _area_vectors(x, self.surfaces.triangles[a]) + _area_vectors(x, self.surfaces.triangles[b])
 
     def _contacts(self, pairs: list[_Pairs], limited: bool) -> Contacts:
         s = self.surfaces
-        p = _Pairs(*(np.concatenate([getattr(q, name) for q in pairs]) for name in _Pairs.__dataclass_fields__))
-        free = ~self.fixed[p.vertices].all(1)
-        p = _Pairs(*(getattr(p, name)[free] for name in _Pairs.__dataclass_fields__))
+        p = _Pairs(*(np.concatenate([getattr(q, f.name) for q in pairs]) for f in fields(_Pairs)))
+        p = p.some(~self.fixed[p.vertices].all(1))
         apart = p.first - p.second
         distance = np.linalg.norm(apart, axis=1)
         outward = p.outward / np.maximum(np.linalg.norm(p.outward, axis=1), 1e-300)[:, None]
@@ -202,7 +228,10 @@ class SurfaceDetector:
         """InputError if a body lies wholly inside another at x: no way out is then the shortest."""
         if self.tets is None or not self.several:
             return
-        inside = self._inside(np.ascontiguousarray(x, float), self.vertex, self.meets_others, None)
+        nothing = np.full(len(self.vertex), -1)
+        self.were_inside[False][:] = True
+        x = np.ascontiguousarray(x, float)
+        inside, _ = self._inside(x, nothing, np.zeros((len(nothing), 3)), self.meets_others, None)
         body = self.body[self.vertex]
         for b in np.unique(body):
             solids, count = np.unique(inside[body == b], return_counts=True)
@@ -212,6 +241,12 @@ class SurfaceDetector:
                     f"contact: body {names[b]!r} starts fully inside body {names[solids[0]]!r} ({count[0]} vertices);"
                     " move one of them"
                 )
+
+
+def _area_vectors(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Twice the area vectors of triangles, (k, 3)."""
+    a, b, c = x[triangles].transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
 
 
 def _beside(triangles: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -246,10 +281,23 @@ class Detector:
         self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
         self.free = spec.surface[~fixed[spec.surface]]
         self.seconds = Seconds()
+        self.since: tuple[np.ndarray, float] | None = None  # where the last step began, and when [s]
         self.borne = np.zeros((len(X), 3))  # with what force [N] colliders bear each vertex
 
-    def _last_borne(self, vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        return np.maximum((self.borne[vertex] * normal).sum(1), 0.0)
+    def _friction(self, touches: list[Touches], vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """What friction may bear of each half-space [N]: its coefficient times what was last borne along the normal."""
+        coefficient = np.repeat([c.friction for c in self.spec.colliders], [len(t.vertex) for t in touches])
+        return coefficient * np.maximum((self.borne[vertex] * normal).sum(1), 0.0)
+
+    def _anchors(self, touches: list[Touches], vertex: np.ndarray, t: float) -> np.ndarray:
+        """Where vertices would be at time t had they stuck to the colliders since the step began, (k, 3) [m]."""
+        assert self.since is not None
+        x, t0 = self.since
+        slips = [
+            c.carried(q.point, t0, t) if c.friction else np.zeros((len(q.vertex), 3))
+            for c, q in zip(self.spec.colliders, touches)
+        ]
+        return x[vertex] + np.concatenate(slips)
 
     def check(self, x: np.ndarray) -> None:
         """As :meth:`SurfaceDetector.check`."""
@@ -262,24 +310,25 @@ class Detector:
         """Contacts of a step from x0 at time t0 to, it is expected, x1 at t1 (n_vert, 3); see the module.
 
         ``limited`` is for motion (:meth:`SurfaceDetector.find`); ``ahead`` [m] is how far from x1 vertices may come to
-        lie.
+        lie. With t0 = t1 the step goes on in which contacts were sought last: friction counts from where that began.
         """
+        if t0 < t1 or self.since is None:
+            self.since = x0, t0
         clock = time.perf_counter()
         found = self.surfaces.find(x0, x1, limited, ahead) if self.surfaces else Contacts()
         now = time.perf_counter()
         self.seconds.surfaces += now - clock
         touches = [c.touch(x0[self.free], x1[self.free], t0, t1, self.spec.margin + ahead) for c in self.spec.colliders]
         if touches:
-            normal, slip = (np.concatenate([getattr(t, name) for t in touches]) for name in ("normal", "slip"))
+            normal = np.concatenate([t.normal for t in touches])
             vertex = self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32)
-            coefficient = np.repeat([c.friction for c in self.spec.colliders], [len(t.vertex) for t in touches])
             found = replace(
                 found,
                 vertex=vertex,
                 plane=normal,
                 level=(normal * np.concatenate([t.point for t in touches])).sum(1),
-                friction=coefficient * self._last_borne(vertex, normal),
-                anchor=x0[vertex] + slip,
+                friction=self._friction(touches, vertex, normal),
+                anchor=self._anchors(touches, vertex, t1),
                 creep=CREEP * self.spec.margin,
             )
         self.seconds.colliders += time.perf_counter() - now

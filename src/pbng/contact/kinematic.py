@@ -261,9 +261,16 @@ class Kinematic(Collider):
         chosen |= held
         chosen[struck] = True
         triangle, weights, normal = triangle[chosen], weights[chosen], turned(poses[-1], normal[chosen])
-        x = to_world(poses[-1], last.points(triangle, weights))
-        slip = x - to_world(poses[0], first.points(triangle, weights))
-        return Touches(index[chosen], x + self.thickness * normal, normal, slip)
+        point = to_world(poses[-1], last.points(triangle, weights)) + self.thickness * normal
+        return Touches(index[chosen], point, normal)
+
+    def carried(self, points: np.ndarray, t0: float, t1: float) -> np.ndarray:
+        """As of other colliders; the material of a mesh that deforms is that of the closest point."""
+        if self._rigid:
+            return super().carried(points, t0, t1)
+        first, last = self._shape(t0), self._shape(t1)
+        near = self._closest(last, np.asarray(points, float))
+        return near.point - first.points(near.triangle, near.weights)
 
     def _struck(self, shapes: list[_Shape], path: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The triangle that each path first runs into, or -1, weights there and the side it comes from."""

@@ -47,12 +47,12 @@ class ContactNodes:
     Args:
         problem: What is solved.
         packed: Its layout.
-        surface: Vertices that may come into contact, (n,), ascending.
     """
 
-    def __init__(self, problem: Problem, packed: Packed, surface: np.ndarray) -> None:
-        self.problem, self.packed, self.surface = problem, packed, surface
-        self.neighbours = _neighbours(problem, surface)
+    def __init__(self, problem: Problem, packed: Packed) -> None:
+        assert problem.contact is not None
+        self.problem, self.packed = problem, packed
+        self.neighbours = _neighbours(problem, problem.contact.surface)
         self.color = problem.color.copy()  # of the last step, for nodes that were in contact then
         self.node = np.empty(0, np.int64)  # in contact, in order of the problem
         self.recolored = self.repacked = 0  # nodes so far, and how long it took [s]
@@ -149,8 +149,8 @@ class ContactNodes:
             return
         p, r = self.packed, self.rows
         arrays = (
-            x, r.seg_start, r.seg, r.idx, r.coef, r.nodal, p.parameters, np.array([omega, self.creep], p.dtype), self.place,
-            self.first, self.other, self.row, self.force,
+            x, r.seg_start, r.seg, r.idx, r.coef, r.nodal, p.parameters, np.array([omega, self.creep], p.dtype),
+            self.place, self.first, self.other, self.row, self.force,
         )  # fmt: skip
         blocks = specialised(make_contact_sweep, p.functions, p.dtype)
         run(blocks, arrays, np.arange(len(self.color_start) - 1), self.color_start, 4)
@@ -228,14 +228,14 @@ def _step(at, x, acc, l, omega, creep, low, high, other, row, force):
     for c in range(low, high):
         # What sticks or rubs is a spring across the normal; that of friction bounds its energy, as it is concave in u².
         k, w, F = row[c, 10], row[c, 0], row[c, 11]
-        if k > real(0) or F > real(0):
+        if max(k, F) > real(0):
             n = row[c, 5], row[c, 6], row[c, 7]
             C = _gap_vector(c, at, x, other, row)
-            if F > real(0):
+            if real(0) < F:
                 C = C[0] - row[c, 12], C[1] - row[c, 13], C[2] - row[c, 14]
             along = dot(n, C)
             u = sub(C, scale(along, n))
-            if F > real(0):
+            if real(0) < F:
                 k = F / math.sqrt(dot(u, u) + creep * creep)
             f0 -= w * k * u[0]
             f1 -= w * k * u[1]

@@ -28,6 +28,8 @@ class ElementKind(ABC):
     others: ClassVar[int]
     opposite: ClassVar[np.ndarray]  # (corners, others): for each corner, the local numbers of the others, in order
     across: ClassVar[float] = 0.0  # part of F₃₃ that does not come from the vertices
+    solid: ClassVar[bool] = True  # whether elements fill space, or the plane, and can be inverted; cloth does not
+    compound_width: ClassVar[int] = 0  # coefficients stored for one incidence of a compound node
 
     @property
     def order(self) -> list[int]:
@@ -40,11 +42,13 @@ class ElementKind(ABC):
 
     @abstractmethod
     def gradients(self, X: np.ndarray) -> np.ndarray:
-        """Gradients (n, corners, 3) [1/m] of the shape functions of elements X (n, corners, 3) at rest."""
+        """Gradients (n, corners, 3) [1/m] of the shape functions of elements X (n, corners, 3) at rest, or [rad/m] of
+        the angle of hinges."""
 
     @abstractmethod
     def volume(self, X: np.ndarray) -> np.ndarray:
-        """Rest volumes (n,) [m³] of elements X (n, corners, 3)."""
+        """Rest volumes (n,) [m³] of elements X (n, corners, 3): what their energy density is multiplied by, so areas
+        [m²] of membranes and weights of hinges."""
 
     @abstractmethod
     def pack(self, isotropic: bool) -> Any:
@@ -57,6 +61,10 @@ class ElementKind(ABC):
         """``(n, i, c, x, idx, coef, par, p, g, acc)``: for n rows from ``idx[i]`` and ``coef[c]``, add forces and
         Hessians of the W nodes of a block to ``acc``; the material's numbers start at ``par[p]``."""
 
+    def paper_sweep(self, model: Model) -> Any:
+        """The same with the paper's block, where that differs in form and not only by its numbers."""
+        return self.sweep(model)
+
     @abstractmethod
     def energy(self, model: Model) -> Any:
         """``(m, i, x, X, idx, par, p, gx, gX, out, f) -> (energy [J], 0)`` of the first m of the W elements at
@@ -66,6 +74,14 @@ class ElementKind(ABC):
     def forces(self, model: Model) -> Any:
         """The same, with the forces on the elements' corners added to f; returns the sum of the norms of the
         elements' forces [N] and the number of inverted elements."""
+
+    def compound_pack(self) -> Any:
+        """As :meth:`pack`, for compound nodes; of simplices see :mod:`pbng.elements.compound`."""
+        raise NotImplementedError
+
+    def compound_sweep(self, model: Model) -> Any:
+        """As :meth:`sweep`, for compound nodes."""
+        raise NotImplementedError
 
 
 class Term(NamedTuple):

@@ -1,6 +1,7 @@
 """How a compound node (:mod:`pbng.compounds`) sees a simplex: F changes by d ⊗ g with g = Σ β_v ∂N_v/∂X.
 
-All corners are gathered, since several may move; coefficients are the shape gradients, g and the volume.
+All corners are gathered, since several may move; coefficients are the shape gradients, g and the volume. Other kinds
+say themselves how a compound sees them.
 """
 
 from functools import cache
@@ -9,25 +10,39 @@ from typing import Any
 import numpy as np
 from numba import uint64
 
-from pbng.elements.base import W, gather, parameters, vec
+from pbng.elements.base import ElementKind, W, gather, parameters, vec
 from pbng.elements.simplex import Simplex, corner, gradients, outer_sum
 from pbng.jit import inline
 from pbng.linalg import cofactor, mat_vec, scale, sub
 from pbng.materials.base import Model
 
-WIDTH = 13  # coefficients of an incidence
+WIDTH = 13  # coefficients of an incidence of a simplex
 zero = uint64(0)
 _1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11, _12 = (uint64(W * j) for j in range(1, 13))
 
 
-def corners(kind: Simplex) -> np.ndarray:
+def corners(kind: ElementKind) -> np.ndarray:
     """Which corners an incidence refers to, in their order, (1, corners)."""
     return np.array([kind.order], np.int64)
 
 
-@cache
-def pack(kind: Simplex) -> Any:
+def width(kind: ElementKind) -> int:
+    """Coefficients stored for one incidence."""
+    return WIDTH if isinstance(kind, Simplex) else kind.compound_width
+
+
+def pack(kind: ElementKind) -> Any:
     """As :meth:`pbng.elements.base.ElementKind.pack`; ``data`` holds how much each corner moves with the compound."""
+    return _pack(kind) if isinstance(kind, Simplex) else kind.compound_pack()
+
+
+def sweep(kind: ElementKind, model: Model) -> Any:
+    """As :meth:`pbng.elements.base.ElementKind.sweep`."""
+    return _sweep(kind, model) if isinstance(kind, Simplex) else kind.compound_sweep(model)
+
+
+@cache
+def _pack(kind: Simplex) -> Any:
     plane, share = kind.plane, kind.share
 
     @inline
@@ -59,8 +74,7 @@ def pack(kind: Simplex) -> Any:
 
 
 @cache
-def sweep(kind: Simplex, model: Model) -> Any:
-    """As :meth:`pbng.elements.base.ElementKind.sweep`."""
+def _sweep(kind: Simplex, model: Model) -> Any:
     edges, numbers, stress, n_corner = kind.edges(vec), parameters(model.n_parameters), model.stress, kind.corners
     last, row = uint64(4 * W * (n_corner - 1)), uint64(W * n_corner)
 

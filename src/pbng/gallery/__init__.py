@@ -94,6 +94,56 @@ _ENTRIES = (
         "cells along the longest side, 32",
         takes_surface=True,
     ),
+    Entry(
+        "two_blocks_colliding",
+        "pbng.gallery.contact",
+        "Fig. 13",
+        "Two blocks are driven against each other, and drawn apart again (with inertia).",
+        "vertices along an edge of each block, 16",
+    ),
+    Entry(
+        "dropping_shapes",
+        "pbng.gallery.falling",
+        "Fig. 14",
+        "Boxes, balls, rings, planks and rods, 40 in all, fall into a glass box (with inertia).",
+        "vertices along an edge of a box, 12",
+    ),
+    Entry(
+        "armadillos",
+        "pbng.gallery.falling",
+        "Fig. 16",
+        "Bodies from a file, or little dragons, fall onto a cloth that gives way, and into a box (with inertia).",
+        "cells along the longest side of each, 24",
+        takes_surface=True,
+    ),
+    Entry(
+        "squeezed_ball",
+        "pbng.gallery.contact",
+        "",
+        "A ball is squeezed between two plates, and let go.",
+        "vertices along a diameter, 20",
+    ),
+    Entry(
+        "cloth_on_sphere",
+        "pbng.gallery.cloth",
+        "",
+        "A square cloth falls on a ball and hangs down in folds (with inertia).",
+        "vertices along an edge, 48",
+    ),
+    Entry(
+        "hanging_cloth",
+        "pbng.gallery.cloth",
+        "Fig. 19",
+        "A rectangle of cloth, held by two corners, falls and swings (with inertia).",
+        "vertices along the short side, 32",
+    ),
+    Entry(
+        "twisted_cloth",
+        "pbng.gallery.cloth",
+        "",
+        "A strip of cloth is twisted by three turns, wrinkles and coils (with inertia).",
+        "vertices across the strip, 24",
+    ),
 )
 
 SCENES: Mapping[str, Entry] = MappingProxyType({entry.name: entry for entry in _ENTRIES})

@@ -31,7 +31,7 @@ def hanging_bar(resolution: int = 9) -> Recipe:
         resolution: Vertices across the bar.
     """
     scene = Scene(gravity=(0.0, -GRAVITY, 0.0), name="hanging_bar")
-    bar = scene.add(beam(1.0, 0.25, resolution), Corotated(E=1e3, nu=0.3, density=10.0), "bar")
+    bar = scene.add(beam(1.0, 0.25, resolution), Corotated(E=1e3, nu=0.3, density=10.0), name="bar")
     scene.move(bar.where(x=0.0), Eased(Rotate("z", -0.5)), over=2.0)
     return _recipe(scene, 10.0 * 0.25**2)
 
@@ -51,11 +51,11 @@ def bent_surface(surface: str | os.PathLike[str] | TriMesh | None = None, resolu
     """
     if not (isinstance(resolution, int) and resolution >= 2):
         raise InputError(f"bent_surface: resolution must be a whole number of at least 2, not {resolution}")
-    mesh = laid_along_x(_filled(surface, resolution))
+    mesh = laid_along_x(filled("bent_surface", surface, resolution))
     E, end = min((softness(mesh, end), end) for end in (1, -1))
     along = end * mesh.X[:, 0]
     scene = Scene(gravity=(0.0, -GRAVITY, 0.0), name="bent_surface")
-    body = scene.add(mesh, Corotated(E=E, nu=0.3, density=DENSITY), "body")
+    body = scene.add(mesh, Corotated(E=E, nu=0.3, density=DENSITY), name="body")
     clamp = body.where(along >= along.max() - HELD * np.ptp(along))
     for start, over, turns in ((0.0, 0.5, -0.12), (0.5, 1.0, 0.24), (1.5, 0.5, -0.12)):
         scene.move(clamp, Eased(Rotate("x", turns)), over=over, start=start)
@@ -96,7 +96,12 @@ def softness(mesh: TetMesh, end: int) -> float:
     return float(np.sum(moment * (length - x) * 4 * np.pi / area**2) * step / (SAG * length))
 
 
-def _filled(surface: str | os.PathLike[str] | TriMesh | None, resolution: int) -> TetMesh:
+def filled(scene: str, surface: str | os.PathLike[str] | TriMesh | None, resolution: int) -> TetMesh:
+    """The tets of a file, or of a surface, by default a little dragon's, ``resolution`` cells along its longest side.
+
+    Raises:
+        InputError: The file cannot be read, or nothing can be made of it.
+    """
     found: Mesh
     if surface is None:
         found = creature()
@@ -107,7 +112,7 @@ def _filled(surface: str | os.PathLike[str] | TriMesh | None, resolution: int) -
     if isinstance(found, TetMesh):
         return found
     if not isinstance(found, TriMesh):
-        raise InputError(f"bent_surface: expected a file or a surface, not {type(surface).__name__}")
+        raise InputError(f"{scene}: expected a file or a surface, not {type(surface).__name__}")
     return tetrahedralize(found, cell=float(np.ptp(found.X, axis=0).max()) / resolution)
 
 

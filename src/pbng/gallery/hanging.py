@@ -20,8 +20,8 @@ def two_blocks_hanging(resolution: int = 16, k: float = 1e8) -> Recipe:
     """
     scene = Scene(gravity=GRAVITY, name="two_blocks_hanging")
     flesh = Corotated(E=E, nu=NU, density=DENSITY)
-    upper = scene.add(box((1.0, 1.0, 1.0), resolution), flesh, "upper", at=(0.0, 1.0 + GAP, 0.0))
-    lower = scene.add(box((1.0, 1.0, 1.0), resolution), flesh, "lower")
+    upper = scene.add(box((1.0, 1.0, 1.0), resolution), flesh, name="upper", at=(0.0, 1.0 + GAP, 0.0))
+    lower = scene.add(box((1.0, 1.0, 1.0), resolution), flesh, name="lower")
     scene.pin(upper.where(y=2.0 + GAP))
     scene.bind(lower.where(y=1.0), upper.where(y=1.0 + GAP), k=k)
     return Recipe(scene, frames=1, budget=Budget(rtol=1e-9, iterations=200))
@@ -34,6 +34,6 @@ def swinging_block(resolution: int = 16) -> Recipe:
         resolution: Vertices along an edge; 16 are the paper's 4.1 K.
     """
     scene = Scene(gravity=GRAVITY, name="swinging_block")
-    block = scene.add(box((1.0, 1.0, 1.0), resolution), Corotated(E=E, nu=NU, density=DENSITY), "block")
+    block = scene.add(box((1.0, 1.0, 1.0), resolution), Corotated(E=E, nu=NU, density=DENSITY), name="block")
     scene.pin(block.where(x=0.0))
     return Recipe(scene, frames=61, inertia=True, substeps=2)

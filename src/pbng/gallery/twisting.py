@@ -56,7 +56,7 @@ def constitutive_models(resolution: int = 32) -> Recipe:
 
 
 def _block(scene: Scene, n: int, material: Material, name: str, story: int = 0) -> Body:
-    return scene.add(box((1.0, 1.0, 1.0), n, (-0.5, -0.5, -0.5)), material, name, at=(0.0, SPACING * story, 0.0))
+    return scene.add(box((1.0, 1.0, 1.0), n, (-0.5, -0.5, -0.5)), material, name=name, at=(0.0, SPACING * story, 0.0))
 
 
 def _twist(scene: Scene, block: Body) -> None:

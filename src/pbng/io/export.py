@@ -6,7 +6,8 @@
     ply   the drawn surface a frame, binary, with the bits of the run
     pc2   one .obj of the drawn surface at rest and one point cache of all frames            (Blender's Mesh Cache)
 
-The bodies of a run are merged into one file a frame, unless ``split`` asks for a series a body.
+The bodies of a run, and if wanted its colliders, are merged into one file a frame, unless ``split`` asks for a series a
+body.
 """
 
 import os
@@ -21,7 +22,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from pbng.errors import InputError
-from pbng.io.frames import Run
+from pbng.io.colliders import behind
+from pbng.io.frames import Run, StoredFrame
 
 FORMATS = ("vtu", "vtp", "obj", "ply", "pc2")
 
@@ -32,6 +34,7 @@ def export(
     format: str | None = None,
     *,
     split: bool = False,
+    colliders: bool = False,
 ) -> list[Path]:
     """Write a run in another format; returns the files written, the one to open last.
 
@@ -41,6 +44,7 @@ def export(
             the files ("out/twist.obj" gives out/twist_0000.obj, ...). Files of the same name are replaced.
         format: One of ``FORMATS``; by default what the path ends in.
         split: Write each body into files of its own, named after it, rather than all into one.
+        colliders: Write the surfaces of colliders too, as if they were further bodies.
 
     Raises:
         InputError: The format is unknown, the run cannot be read, or a file cannot be written.
@@ -52,11 +56,12 @@ def export(
     if format not in FORMATS:
         raise InputError(f"cannot export {format or str(path)!r}: expected one of {', '.join(FORMATS)}")
     folder, name = (path.parent, path.stem) if suffix == format else (path, path.name)
+    further = behind(run.bodies, run.colliders) if colliders else ()
     write = _point_cache if format == "pc2" else _series
     try:
         folder.mkdir(parents=True, exist_ok=True)
         written = []
-        for part, bodies in _parts(run, name, split):
+        for part, bodies in _parts((*run.bodies, *further), name, split):
             written += write(run, bodies, folder / f"{part}.{format}")
     except OSError as error:
         raise InputError(f"cannot export to {error.filename or folder}: {error.strerror or error}") from error
@@ -75,14 +80,19 @@ def drawn(bodies: Sequence[Any], x: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     return np.concatenate(points), np.concatenate(triangles), np.concatenate(owner)
 
 
-def _parts(run: Run, name: str, split: bool) -> Iterator[tuple[str, Sequence[Any]]]:
+def _parts(bodies: Sequence[Any], name: str, split: bool) -> Iterator[tuple[str, Sequence[Any]]]:
     if not split:
-        yield name, run.bodies
+        yield name, bodies
         return
-    for k, body in enumerate(run.bodies):
+    for k, body in enumerate(bodies):
         label = re.sub(r"[^\w.-]+", "_", body.name)
-        unique = sum(other.name == body.name for other in run.bodies) == 1
+        unique = sum(other.name == body.name for other in bodies) == 1
         yield (f"{name}_{label}" if unique and label else f"{name}_{label}{k}"), [body]
+
+
+def _positions(frame: StoredFrame) -> np.ndarray:
+    """Positions (n, 3) [m] of bodies and, behind them, colliders."""
+    return np.concatenate([frame.x, *(points.astype(frame.x.dtype) for points in frame.colliders)])
 
 
 def _series(run: Run, bodies: Sequence[Any], path: Path) -> list[Path]:
@@ -92,13 +102,14 @@ def _series(run: Run, bodies: Sequence[Any], path: Path) -> list[Path]:
     written, times = [], []
     for k in range(len(run)):
         frame = run[k]
+        x = _positions(frame)
         file = path.with_name(f"{path.stem}_{k:0{digits}d}{path.suffix}")
         if kind == "obj":
-            _write(file, partial(_obj, bodies, frame.x))
+            _write(file, partial(_obj, bodies, x))
         elif kind == "ply":
-            _write(file, partial(_ply, bodies, frame.x))
+            _write(file, partial(_ply, bodies, x))
         else:
-            dataset = (_vtk_cells if kind == "vtu" else _vtk_surface)(bodies, frame.x)
+            dataset = (_vtk_cells if kind == "vtu" else _vtk_surface)(bodies, x)
             with _whole(file):
                 dataset.save(file)
         written.append(file)
@@ -127,7 +138,7 @@ def _point_cache(run: Run, bodies: Sequence[Any], path: Path) -> list[Path]:
         out.write(np.array([0, 1], "<f4").tobytes())  # first frame, frames a sample
         out.write(np.array(len(run), "<i4").tobytes())
         for k in range(len(run)):
-            out.write(drawn(bodies, run[k].x)[0].astype("<f4").tobytes())
+            out.write(drawn(bodies, _positions(run[k]))[0].astype("<f4").tobytes())
 
     _write(path, cache)
     return [topology, path]

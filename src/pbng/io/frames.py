@@ -2,7 +2,8 @@
 
     twist/run.json            what the run is: bodies, frames a second, anything the user adds; marks the folder as ours
     twist/body_000.npz        one mesh a body, with groups and skin
-    twist/frame_000000.npz    one file a frame: positions, status, residuals
+    twist/collider_000.npz    one surface a collider
+    twist/frame_000000.npz    one file a frame: positions, status, residuals, contact, points of colliders that move
 
 Each file is written under a temporary name and moved into place once it is complete and on the disk. A run is marked
 before it has frames and unmarked after it has lost them, so no order of events leaves frames without their mark.
@@ -12,7 +13,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self, overload
@@ -21,14 +22,16 @@ import numpy as np
 
 from pbng import __version__
 from pbng.errors import InputError
+from pbng.io.colliders import ColliderShape, colliders_of, shapes_of
 from pbng.io.store import mesh_arrays, packed, put, read_mesh, reading, temporary_of, unpacked
-from pbng.mesh import Mesh
+from pbng.mesh import Mesh, TriMesh
 
 FORMAT = "pbng run"
 FORMAT_VERSION = 1
 MANIFEST = "run.json"
 _FRAME = re.compile(r"frame_(\d{6,})\.npz")
-_OURS = re.compile(r"run\.json|body_\d{3,}\.npz|frame_\d{6,}\.npz")
+_OURS = re.compile(r"run\.json|(body|collider)_\d{3,}\.npz|frame_\d{6,}\.npz")
+_CONTACT = "contact_"  # what the numbers of a contact report are stored under begins so
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +45,30 @@ class StoredBody:
 
 
 @dataclass(frozen=True, eq=False)
+class StoredContact:
+    """What touched at the end of a frame, as :class:`pbng.equilibrium.ContactReport` has it."""
+
+    pairs: int
+    walls: int
+    deepest: float
+    mean: float
+    size: float
+    vertices: np.ndarray = field(repr=False)
+    recolored: int
+    repacked: int
+    detect_seconds: float
+    pack_seconds: float
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
 class StoredFrame:
     """A frame read back: positions x [m] (n_vert, 3) at time t [s], with what the solver said of it.
 
     ``residuals`` [N] (k,) are those of the iterations ``monitored`` (k,), ``energy`` is in J, ``seconds`` [s] the
     solver's time. If the run had inertia there are velocities v [m/s] (n_vert, 3), and if it had weak constraints there
-    are ``springs`` [m] (m, 2, 3), their ends.
+    are ``springs`` [m] (m, 2, 3), their ends. If something could touch, ``contact`` tells what did; ``colliders`` are
+    the points [m] (n, 3) of each of the run's colliders.
     """
 
     index: int
@@ -62,6 +83,8 @@ class StoredFrame:
     inverted: int
     v: np.ndarray | None = field(default=None, repr=False)
     springs: np.ndarray | None = field(default=None, repr=False)
+    contact: StoredContact | None = None
+    colliders: tuple[np.ndarray, ...] = field(default=(), repr=False)
 
 
 class FrameWriter:
@@ -72,7 +95,8 @@ class FrameWriter:
         fps: Frames a second at which the run is meant to be played.
         overwrite: Replace the run that the folder holds, when the first frame comes. Other files in it are kept, and
             a folder that is not a run is never touched.
-        append: Continue the run that the folder holds, whose bodies must be the same; its fps and info stay.
+        append: Continue the run that the folder holds, whose bodies and colliders must be the same; its fps and info
+            stay.
         info: Anything worth keeping with the run that JSON can hold.
 
     Raises:
@@ -151,7 +175,7 @@ class FrameWriter:
             energy=np.float64(result.energy),
             seconds=np.float64(result.seconds),
             inverted=np.int64(result.inverted),
-            **{name: a for name, a in _further(frame) if len(a)},
+            **dict(_further(frame)),
         )
         try:
             if self._n_vert is None:
@@ -166,9 +190,9 @@ class FrameWriter:
         self.n_written += 1
 
     def _begin(self, problem: Any) -> None:
-        bodies = list(problem.bodies)
+        bodies, colliders = list(problem.bodies), shapes_of(problem)
         if self.n_written:  # appending
-            _require_same(self.path, Run(self.path).bodies, bodies)
+            _require_same(self.path, Run(self.path), bodies, colliders)
             return
         # From the last frame down: stopped half-way, what is left is a shorter run, or one without frames.
         for _, file in sorted(_frame_files(self.path).items(), reverse=True):
@@ -176,6 +200,10 @@ class FrameWriter:
         entries = [
             {"name": str(b.name), "start": int(b.start), "stop": int(b.stop), "mesh": f"body_{k:03d}.npz"}
             for k, b in enumerate(bodies)
+        ]
+        shapes = [
+            {"name": c.name, "kind": c.kind, "moves": c.moves, "mesh": f"collider_{k:03d}.npz"}
+            for k, c in enumerate(colliders)
         ]
         manifest = {
             "format": FORMAT,
@@ -185,13 +213,14 @@ class FrameWriter:
             "name": str(getattr(problem, "name", "") or self.path.stem),
             "fps": self.fps,
             "bodies": entries,
+            "colliders": shapes,
             "info": self.info,
         }
         put(self.path / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
         for file in self.path.iterdir():
             if _OURS.fullmatch(file.name) and file.name != MANIFEST:
                 file.unlink()
-        for entry, body in zip(entries, bodies):
+        for entry, body in zip([*entries, *shapes], [*bodies, *colliders]):
             put(self.path / str(entry["mesh"]), packed(**mesh_arrays(body.mesh)))
 
     def __enter__(self) -> Self:
@@ -209,6 +238,7 @@ class Run(Sequence[StoredFrame]):
         name: Name of the problem.
         fps: Frames a second at which it is meant to be played.
         bodies: The bodies, each with its mesh at rest.
+        colliders: What they could run into, each with its surface before any motion.
         info: When and by which version it was written, and what its writer was told to keep.
 
     Raises:
@@ -230,6 +260,10 @@ class Run(Sequence[StoredFrame]):
             StoredBody(b["name"], b["start"], b["stop"], reading(self.path / b["mesh"], read_mesh))
             for b in manifest["bodies"]
         )
+        self.colliders = tuple(
+            ColliderShape(c["name"], c["kind"], c["moves"], reading(self.path / c["mesh"], _surface))
+            for c in manifest.get("colliders", ())  # older runs have none
+        )
 
     def __len__(self) -> int:
         return len(self._files)
@@ -240,8 +274,13 @@ class Run(Sequence[StoredFrame]):
     def __getitem__(self, i: slice) -> list[StoredFrame]: ...
     def __getitem__(self, i: int | slice) -> StoredFrame | list[StoredFrame]:
         if isinstance(i, slice):
-            return [reading(file, _frame) for file in self._files[i]]
-        return reading(self._files[i], _frame)
+            return [self._read(file) for file in self._files[i]]
+        return self._read(self._files[i])
+
+    def _read(self, file: Path) -> StoredFrame:
+        frame, moving = reading(file, _frame)
+        points = tuple(moving.get(k, shape.mesh.X) for k, shape in enumerate(self.colliders))
+        return replace(frame, colliders=points)
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r}: {len(self)} frames of {', '.join(body.name for body in self.bodies)})"
@@ -266,24 +305,45 @@ def _manifest(file: Path) -> dict[str, Any]:
 def _further(frame: Any) -> Iterator[tuple[str, np.ndarray]]:
     """What only some frames have."""
     for name in ("v", "springs"):
-        if getattr(frame, name, None) is not None:
+        if getattr(frame, name, None) is not None and len(getattr(frame, name)):
             yield name, np.asarray(getattr(frame, name))
+    contact = getattr(frame, "contact", None)
+    if contact is not None:
+        for f in fields(StoredContact):
+            yield _CONTACT + f.name, np.asarray(getattr(contact, f.name))
+    for k, collider in enumerate(colliders_of(frame.problem)):
+        if collider.motion is not None:
+            yield f"collider_{k:03d}", collider.surface(frame.t)[0].astype(np.asarray(frame.x).dtype)
 
 
-def _frame(file: Path) -> StoredFrame:
+def _frame(file: Path) -> tuple[StoredFrame, dict[int, np.ndarray]]:
+    """A frame, and the points of colliders that move."""
     values: dict[str, Any] = {name: a if a.ndim else a.item() for name, a in unpacked(file).items()}
-    return StoredFrame(**values)
+    moving = {int(name[9:]): values.pop(name) for name in list(values) if re.fullmatch(r"collider_\d{3,}", name)}
+    contact = {name[len(_CONTACT) :]: values.pop(name) for name in list(values) if name.startswith(_CONTACT)}
+    return StoredFrame(**values, contact=StoredContact(**contact) if contact else None), moving
 
 
-def _require_same(path: Path, stored: Sequence[StoredBody], bodies: Sequence[Any]) -> None:
-    same = len(stored) == len(bodies) and all(
-        (a.name, a.start, a.stop) == (b.name, b.start, b.stop)
-        and np.array_equal(a.mesh.X, b.mesh.X)
-        and np.array_equal(a.mesh.cells, b.mesh.cells)
-        for a, b in zip(stored, bodies)
-    )
-    if not same:
+def _surface(file: Path) -> TriMesh:
+    mesh = read_mesh(file)
+    if not isinstance(mesh, TriMesh):
+        raise InputError("it is not a surface")
+    return mesh
+
+
+def _require_same(path: Path, run: Run, bodies: Sequence[Any], colliders: Sequence[ColliderShape]) -> None:
+    def same(stored: Sequence[Any], given: Sequence[Any], *names: str) -> bool:
+        return len(stored) == len(given) and all(
+            all(getattr(a, name) == getattr(b, name) for name in names)
+            and np.array_equal(a.mesh.X, b.mesh.X)
+            and np.array_equal(a.mesh.cells, b.mesh.cells)
+            for a, b in zip(stored, given)
+        )
+
+    if not same(run.bodies, bodies, "name", "start", "stop"):
         raise InputError(f"cannot append to {path}: its bodies are not those of the frame")
+    if not same(run.colliders, colliders, "name", "kind", "moves"):
+        raise InputError(f"cannot append to {path}: its colliders are not those of the frame")
 
 
 def _frame_files(path: Path) -> dict[int, Path]:

@@ -40,7 +40,7 @@ class ConstraintForm(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """Base of every solid material.
+    """Base of every material of solids and surfaces.
 
     A subclass defines two functions of the deformation gradient F (a tuple of three columns, see :mod:`pbng.linalg`)
     and of the model's own parameters, both without ``self``::
@@ -63,6 +63,7 @@ class Material:
     nu: float
     density: float = 1000.0
 
+    surface: ClassVar[bool] = False  # F has two columns, Ψ is per area [J/m²]: for triangles in space (cloth)
     isotropic: ClassVar[bool] = True  # Ψ(F Q) = Ψ(F) for rotations Q; lets the kernels choose the material frame
     energy: ClassVar[Callable[..., float]]
     stress: ClassVar[Callable[..., Any]]

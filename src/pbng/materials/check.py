@@ -93,6 +93,8 @@ def check_material(material: Material) -> Report:
     """
     if not isinstance(material, Material):
         raise InputError(f"check_material: expected a material such as Corotated(E=1e5, nu=0.3), not {material!r}")
+    if material.surface:
+        raise InputError(f"check_material: {type(material).__name__} is a material of surfaces; it checks solids only")
     return _Check(material).report()
 
 

@@ -246,9 +246,10 @@ def _pictures(
 def _strip(settings: Settings, problem: Problem, motions: dict[str, Motion]) -> Any:
     """Six moments of both blocks side by side."""
     (body,) = problem.bodies
+    material: Any = problem.groups[0].material
     scene, place = Scene(name="both"), np.array([1.0 + APART, 0.0, 0.0])
     for k, name in enumerate(("XPBD", "PBNG")):
-        block = scene.add(body.mesh, problem.groups[0].material, name, at=tuple(k * place))
+        block = scene.add(body.mesh, material, name=name, at=tuple(k * place))
         scene.pin(block.where(x=k * place[0]))
     both, steps = scene.compile(), len(motions["PBNG"].ratios)
     states = {}

@@ -28,8 +28,8 @@ def run(
     The first residual is that of x. If ``before`` is x with the prescribed vertices where they were until now, the
     method may then begin at a better state, which it makes from the movement. The clock leaves out compilation. Ctrl-C
     ends the loop with the last state computed. ``targets`` are those of the problem's weak constraints (n_target, 3),
-    ``contacts`` what touches during the solve. With ``resume`` x is where the last solve ended, and the method goes on in
-    the precision that it had come to.
+    ``contacts`` what touches during the solve. With ``resume`` x is where the last solve ended, and the method goes on
+    in the precision that it had come to.
     """
     if budget.error is not None and not method.estimates_error:
         raise InputError(f"Budget(error={budget.error}): this method has no estimate of the error; use MultigridPBNG")

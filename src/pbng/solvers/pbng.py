@@ -145,12 +145,12 @@ class PackedMethod:
                 for nodes in self.contact_nodes.values():
                     nodes.update(contacts)
 
-    def _nodes_in_contact(self) -> ContactNodes:
+    def _nodes_in_contact(self, contacts: Contacts) -> ContactNodes:
         """Their layout, in the present precision."""
         name = self.packed.dtype.name
         if name not in self.contact_nodes:
-            self.contact_nodes[name] = ContactNodes(self.problem, self.packed, self.problem.contact.surface)
-            self.contact_nodes[name].update(self.contacts)
+            self.contact_nodes[name] = ContactNodes(self.problem, self.packed)
+            self.contact_nodes[name].update(contacts)
         return self.contact_nodes[name]
 
     def refine(self) -> bool:
@@ -193,7 +193,7 @@ class PackedMethod:
         if self.contacts is None:
             sweep(self.packed, x, self.colors, omega, self.times)
             return
-        nodes = self._nodes_in_contact()
+        nodes = self._nodes_in_contact(self.contacts)
         for _ in range(self.times):
             sweep(nodes.others, x, self.colors, omega)
             nodes.sweep(x, omega)
@@ -240,7 +240,7 @@ class PackedMethod:
     def borne(self) -> np.ndarray:
         """With what force [N] colliders bear each vertex at the state last certified, (n_vert, 3)."""
         out = np.zeros((self.problem.n_vert, 3))
-        if self.touching:
+        if self.touching and self.contacts:
             f = self.forces + self.f_ext
             force = self.touching.borne(self._places(f)) * self.touching.held(self._places(self.x), self.slack(self.x))
             np.add.at(out, self.contacts.vertex, force[:, None] * self.contacts.plane)

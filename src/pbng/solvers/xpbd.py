@@ -12,6 +12,7 @@ import numpy as np
 
 from pbng.contact.contacts import Contacts
 from pbng.errors import InputError
+from pbng.materials.base import Material
 from pbng.packing import aligned, origin_of
 from pbng.problem import Problem
 from pbng.projection.elastic import ElasticPass
@@ -205,7 +206,10 @@ def _check(problem: Problem, name: str, compliant: bool) -> None:
     """InputError if a material or a mass rules out constraints."""
     for group in problem.groups:
         material = group.material
-        form, who = material.constraints(), type(material).__name__
+        who = type(material).__name__
+        if not isinstance(material, Material) or material.surface:
+            raise InputError(f"{name}: constraints are for solids, and {who} is for cloth; take PBNG or Newton")
+        form = material.constraints()
         if form is None:
             raise InputError(
                 f"{name}: {who} has no form as constraints, Ψ = Σ k/2 C²; Corotated and NeoHookean have one"

@@ -1,13 +1,16 @@
 """Where the camera stands: once for a whole motion, so that all of it is in the picture and nothing jumps."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pbng.view.surface import Motion, Surface, springs_of
 
 VIEW_ANGLE = 18.0  # [degrees] from the bottom to the top of the picture: a long lens, for calm perspective
+# Of the size of what the bodies sweep: a collider that reaches no farther from them is in the picture, and of others,
+# such as a large ground, what is that near.
+FAR, NEAR = 1.5, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,32 +18,56 @@ class Extent:
     """What a motion sweeps: the outermost points (n, 3) [m] of it over all frames.
 
     Attributes:
-        points: Those of its surface, followed by the ends of weak constraints.
-        n_ends: How many ends there are.
+        points: Those of the bodies, followed by those of colliders, the ends of weak constraints, and others.
+        n_bodies, n_surface: How many are of the bodies, and of these and colliders; None for all.
     """
 
     points: np.ndarray
-    n_ends: int = 0
+    n_bodies: int | None = None
+    n_surface: int | None = None
 
     @classmethod
     def of(cls, motion: Motion, surface: Surface) -> "Extent":
-        """Looks through all frames once."""
+        """Looks through all frames once. Of colliders, what is far from the bodies does not count."""
         directions = _directions(96)
-        outermost, ends = [], [np.empty((0, 3))]
+        own = surface.owner < surface.n_bodies
+        places = [np.flatnonzero(own), *(np.flatnonzero(surface.owner == k) for k in np.unique(surface.owner[~own]))]
+        swept: list[list[np.ndarray]] = [[] for _ in places]  # of the bodies, and of each collider
+        ends = [np.empty((0, 3))]
         for k in range(len(motion)):
             frame = motion.frames[k]
-            outermost.append(_outermost(surface.points(frame.x), directions))
+            points = surface.points(motion.placed(frame))
+            for part, index in zip(swept, places):
+                part.append(_outermost(points[index], directions))
             springs = springs_of(frame).astype(np.float32)
             springs = springs[np.isfinite(springs).all((1, 2))].reshape(-1, 3)
             if len(springs):
                 ends.append(_outermost(springs, directions))
-        tied = np.concatenate(ends)
-        return cls(np.concatenate([*outermost, tied]).astype(np.float64), len(tied))
+        bodies, *solids = (np.concatenate(part).astype(np.float64) for part in swept)
+        extent = cls(bodies)
+        solids = [extent.around(points) for points in solids]
+        n_surface = len(bodies) + sum(len(points) for points in solids)
+        return cls(np.concatenate([bodies, *solids, *ends]).astype(np.float64), len(bodies), n_surface)
+
+    def around(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of a collider: as they are if none is far, else moved to what is near."""
+        off = np.maximum(self.low - points, points - self.high).max()
+        room = (FAR if off <= FAR * self.size else NEAR) * self.size
+        return np.clip(points, self.low - room, self.high + room)
 
     @property
     def bodies(self) -> "Extent":
-        """What the surface alone sweeps."""
-        return Extent(self.points[: len(self.points) - self.n_ends])
+        """What the bodies alone sweep."""
+        return Extent(self.points[: self.n_bodies])
+
+    @property
+    def surface(self) -> "Extent":
+        """What bodies and colliders sweep."""
+        return Extent(self.points[: self.n_surface])
+
+    def joined(self, points: np.ndarray) -> "Extent":
+        """With further points (k, 3) [m]."""
+        return replace(self, points=np.concatenate([self.points, points]))
 
     @property
     def low(self) -> np.ndarray:

@@ -15,6 +15,8 @@ TURNS = 5.0  # of the spiral
 STRENGTH = 6.5
 MOST_PIXELS = 60.0  # greatest radius looked at
 FLAT = 0.10  # sine of the rise that is overlooked
+DEEP = 0.25  # share of the darkness that the deepest hollows are spared, or folds of cloth would be black
+GREY = 40.0  # difference between the channels of a colour below which it is more or less grey
 BLUR = 4  # [pixels] half the width of the blur, the side of the pattern
 
 
@@ -124,7 +126,10 @@ def _darken(image, depth, light, coarse, jump):
                         total += weight * light[p, q]
                         weights += weight
             dark = max(0.0, 1.0 - (total + 1e-6) / weights)
-            # Darkened colours keep their warmth: red fades least, as it would in light thrown to and fro.
-            image[i, j, 0] = int(image[i, j, 0] * (1.0 - 0.72 * dark) + 0.5)
+            dark -= DEEP * dark * dark
+            # Darkened colours keep their warmth: red fades least, as in light thrown to and fro. Grey has none.
+            red, green, blue = float(image[i, j, 0]), float(image[i, j, 1]), float(image[i, j, 2])
+            warm = min(1.0, (max(red, green, blue) - min(red, green, blue)) / GREY)
+            image[i, j, 0] = int(image[i, j, 0] * (1.0 - (0.78 - 0.06 * warm) * dark) + 0.5)
             image[i, j, 1] = int(image[i, j, 1] * (1.0 - 0.78 * dark) + 0.5)
             image[i, j, 2] = int(image[i, j, 2] * (1.0 - 0.78 * dark) + 0.5)

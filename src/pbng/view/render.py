@@ -12,7 +12,9 @@ import numpy as np
 from pbng.errors import InputError
 from pbng.io.frames import Run
 from pbng.view.camera import Extent, facing, framed, projected_aspect
-from pbng.view.colors import Paint, stretch_map
+from pbng.view.colors import Paint, stretch_map, touching
+from pbng.view.dots import Dots
+from pbng.view.panes import APART, Panes
 from pbng.view.plots import caption, color_bar, over, plot_residuals
 from pbng.view.springs import Springs
 from pbng.view.stage import Floor, Stage
@@ -36,14 +38,16 @@ def picture(
 ) -> Path:
     """Draw one frame as a picture; returns its path.
 
-    Weak constraints are thin lines between what they tie together; of thousands, some hundred are drawn.
+    Weak constraints are thin lines between what they tie together; of thousands, some hundred are drawn. Colliders are
+    grey, planes among them glass, but for the floor.
 
     Args:
         source: A run or its folder, a frame or a sequence of frames, a mesh or a sequence of meshes at rest, or a pair
             of a mesh or a problem and positions (n_vert, 3) [m].
         path: The .png (or .jpg).
         frame: Which frame.
-        color: "stretch" (largest principal stretch, with a colour bar), "body" (a colour a body), or a colour by name.
+        color: "stretch" (largest principal stretch, with a colour bar), "body" (a colour a body), "contact" (red where
+            something touches), or a colour by name.
         size: Width and height [pixels].
         edges: Whether to draw the edges of the triangles; by default only of plane meshes.
         azimuth: Where the camera stands: angle [degrees] from the z axis towards x.
@@ -124,18 +128,19 @@ def sheet(
     return _save(artist.with_bar(page, unit), path)
 
 
-def view(source: Any, out: str | os.PathLike[str] | None = None) -> list[Path]:
+def view(source: Any, out: str | os.PathLike[str] | None = None, color: str = "stretch") -> list[Path]:
     """Look at a run: its last frame, a strip, a film and its residuals; returns the files written.
 
     Args:
         source: A run or its folder.
         out: The folder for the pictures; by default next to the run, its name with "_view" added.
+        color: As :func:`picture` takes it.
     """
     run = source if isinstance(source, Run) else Run(source)
     folder = run.path.parent / f"{run.path.stem}_view" if out is None else Path(out)
-    written = [picture(run, folder / "last.png")]
+    written = [picture(run, folder / "last.png", color=color)]
     if len(run) > 1:
-        written += [sheet(run, folder / "strip.png"), film(run, folder / "film.mp4")]
+        written += [sheet(run, folder / "strip.png", color=color), film(run, folder / "film.mp4", color=color)]
     series, xlabel = _residuals(run)
     return [*written, plot_residuals(series, folder / "residuals.png", xlabel, "residual [N]", run.name)]
 
@@ -148,10 +153,13 @@ class Artist:
         self.edges = self.plane if edges is None else edges
         self.angles = azimuth, elevation
         self.surface = Surface(motion)
-        self.extent = Extent.of(motion, self.surface)
+        self.motion = motion
+        swept = Extent.of(motion, self.surface)
+        self.panes = Panes(motion, swept)
+        self.extent = swept.joined(self.panes.swept)
         self.reach = 0.4 * float(np.median([np.linalg.norm(np.ptp(body.mesh.X, axis=0)) for body in motion.bodies]))
         self.paint = Paint(self.surface, motion, color)
-        self.springs = Springs(springs_of(motion.frames[0]))
+        self.springs, self.dots = Springs(springs_of(motion.frames[0])), Dots(self.surface.edge)
         self._bar: np.ndarray | None = None
 
     def stage(self, size: tuple[int, int], *, tile: bool = False, sampling: int = 3) -> Stage:
@@ -176,6 +184,8 @@ class Artist:
             edges=self.edges,
             sampling=sampling,
             springs=self.springs,
+            dots=self.dots,
+            panes=self.panes,
         )
 
     def aspect(self) -> float:
@@ -187,7 +197,9 @@ class Artist:
 
     def draw(self, stage: Stage, frame: Any, bar: bool = True) -> np.ndarray:
         """The image (height, width, 3) uint8 of a frame."""
-        image = stage(frame.x, self.paint(frame.x), springs_of(frame))
+        x, touched = self.motion.placed(frame), touching(frame)
+        dots = x[touched] if self.paint.contact and touched is not None else np.empty((0, 3))
+        image = stage(x, self.paint(x, touched), springs_of(frame), self.panes(frame), dots)
         return self.with_bar(image, image.shape[0] / 720) if bar else image
 
     def with_bar(self, image: np.ndarray, unit: float) -> np.ndarray:
@@ -199,11 +211,11 @@ class Artist:
         return over(image, self._bar)
 
     def _floor(self, tile: bool) -> Floor:
-        bodies = self.extent.bodies  # springs cast no shadow, but the floor is below them too
-        low, high = bodies.low, bodies.high
-        low[1] = self.extent.low[1]
+        seen = self.extent.surface  # springs and panes cast no shadow, but the floor is below them too
+        low, high = seen.low, seen.high
+        low[1] = self.extent.low[1] if self.panes.floor is None else self.panes.floor
         centre = (low + high) / 2
-        centre[1] = low[1] - 2e-3 * bodies.size  # below what lies on it, or the two would mix
+        centre[1] = low[1] - APART * seen.size  # below what lies on it, or the two would mix
         reach = np.hypot(*(high - low)[[0, 2]]) / 2
         floor = Floor(centre, 1.6 * reach + 1.1 * (high - low)[1], float(high[1] - centre[1]))
         return replace(floor, tint=0.0) if tile else floor

@@ -1,4 +1,4 @@
-"""Weak constraints as thin lines between the points that they tie together.
+"""Weak constraints as thin lines between the points that they tie together, and other lines and colours laid over.
 
 Drawn here rather than by the renderer, whose lines differ from machine to machine. They are laid over the finished
 picture, so that no light or shade takes their colour, where the depth image says that nothing is in front of them.
@@ -43,19 +43,41 @@ class Springs:
             springs: Ends (m, 2, 3) [m] of all weak constraints of the frame.
         """
         springs = springs[self.chosen if len(springs) == self.count else apart(springs, MOST)]
-        springs = springs[np.isfinite(springs).all((1, 2))]
-        height, width = depth.shape
-        places = camera.seen(springs.reshape(-1, 3), (width, height)).reshape(-1, 2, 3)
-        sampling = height // image.shape[0]
-        half = sampling * max(THINNEST, self.width * image.shape[0] / 720) / 2
+        lay_lines(image, depth, camera, springs, self.width, COLOR)
+
+
+def lay_lines(
+    image: np.ndarray,
+    depth: np.ndarray,
+    camera: Camera,
+    ends: np.ndarray,
+    width: float,
+    color: tuple[int, int, int],
+    opacity: float | None = None,
+) -> None:
+    """Draw lines with ends (m, 2, 3) [m] into an image (h, w, 3) uint8, in place, where nothing is before them.
+
+    Args:
+        image, depth, camera: As for :meth:`Springs.draw`.
+        ends: Those that are not finite are left out.
+        width: Of the lines [pixels of a picture 720 high].
+        color: Theirs.
+        opacity: Theirs; by default the less, the more of the picture they cover.
+    """
+    ends = ends[np.isfinite(ends).all((1, 2))]
+    height, across = depth.shape
+    places = camera.seen(ends.reshape(-1, 3), (across, height)).reshape(-1, 2, 3)
+    sampling = height // image.shape[0]
+    half = sampling * max(THINNEST, width * image.shape[0] / 720) / 2
+    if opacity is None:
         covered = 2 * half * np.linalg.norm(places[:, 1, :2] - places[:, 0, :2], axis=1).sum() / depth.size
         opacity = float(np.interp(np.log(max(covered, LITTLE)), np.log([LITTLE, MUCH]), OPACITIES))
-        parallel = camera.parallel is not None
-        # Width of a sample: in a plane of given depth, or at a distance of 1.
-        sample = 2 * (camera.parallel or np.tan(np.radians(VIEW_ANGLE) / 2)) / height
-        through = np.ones_like(depth)
-        _draw(places, half, opacity, sample, parallel, depth, through)
-        _lay(image, through, sampling, np.array(COLOR, float), (1 + opacity) / 2)
+    parallel = camera.parallel is not None
+    # Width of a sample: in a plane of given depth, or at a distance of 1.
+    sample = 2 * (camera.parallel or np.tan(np.radians(VIEW_ANGLE) / 2)) / height
+    through = np.ones_like(depth)
+    _draw(places, half, opacity, sample, parallel, depth, through)
+    lay(image, through, sampling, np.array(color, float), (1 + opacity) / 2)
 
 
 def apart(springs: np.ndarray, most: int) -> np.ndarray:
@@ -120,7 +142,7 @@ def _draw(places, half, opacity, sample, parallel, depth, through):
 
 
 @serial
-def _lay(image, through, k, color, most):
+def lay(image, through, k, color, most):
     """Lay a colour over an image (h, w, 3) where not all of the samples (k h, k w) is let through.
 
     However many lines there are, no more than ``most`` of what is behind them is lost.

@@ -7,10 +7,12 @@ from typing import Self
 import numpy as np
 
 from pbng.view.camera import VIEW_ANGLE, Camera
+from pbng.view.dots import Dots
 from pbng.view.light import Light
 from pbng.view.occlusion import occlude
+from pbng.view.panes import LINE, LINE_OPACITY, LINE_WIDTH, Panes, edges
 from pbng.view.shadow import PIXELS, Shadow
-from pbng.view.springs import Springs
+from pbng.view.springs import Springs, lay_lines
 from pbng.view.surface import Surface
 from pbng.view.window import INK, Window
 
@@ -39,6 +41,8 @@ class Stage:
         edges: Whether to draw the edges of the triangles.
         sampling: Each pixel is the mean of so many by so many.
         springs: What draws weak constraints.
+        dots: What draws vertices in contact.
+        panes: The panes of glass.
 
     Raises:
         InputError: pyvista is not installed, or the machine has nothing to draw with.
@@ -55,10 +59,13 @@ class Stage:
         edges: bool,
         sampling: int,
         springs: Springs,
+        dots: Dots,
+        panes: Panes,
     ) -> None:
         self.surface, self.sampling, self.reach = surface, sampling, reach
         n, triangles = len(surface.source), surface.triangles
-        self.camera, self.frame, self.springs = camera, camera.frame, springs
+        self.camera, self.frame = camera, camera.frame
+        self.springs, self.dots, self.panes = springs, dots, panes
         # A plane seen face on has no shape to model by light.
         self.light = Light(self.frame) if camera.parallel is None else None
         large = sampling * size[0], sampling * size[1]
@@ -66,22 +73,35 @@ class Stage:
         # Light from around has no fine detail: it is found in an image of half the size, which shows the normals.
         self.guide = Window(n, triangles, camera, ((size[0] + 1) // 2, (size[1] + 1) // 2)) if reach > 0 else None
         self.shadow = None if floor is None else self._lay(floor)
+        if len(panes):
+            self.window.add_panes(len(panes))
 
-    def __call__(self, x: np.ndarray, color: np.ndarray, springs: np.ndarray) -> np.ndarray:
-        """The image of the surface when the bodies are at x (n_vert, 3), its points having the colours (n, 3) uint8,
-        and of weak constraints with ends (m, 2, 3) [m].
+    def __call__(
+        self, x: np.ndarray, color: np.ndarray, springs: np.ndarray, panes: np.ndarray, dots: np.ndarray
+    ) -> np.ndarray:
+        """The image of a frame.
+
+        Args:
+            x: Where the parts of the surface are, (n_vert, 3) [m].
+            color: Colours (n, 3) uint8 of its points.
+            springs: Ends (m, 2, 3) [m] of weak constraints.
+            panes: Corners (k, 4, 3) [m] of panes of glass.
+            dots: Vertices in contact, (j, 3) [m].
         """
         points = self.surface.points(x)
         normals = self.surface.normals(points)
         if self.shadow is not None:
             self.shadow(points, self.surface.triangles)
+        if len(panes):
+            self.window.set_panes(*self.panes.glass(panes, self.camera))
         if self.light is None:
             self.window.draw(points, color, color)
         else:
             lit = (np.minimum(color * self.light(side), 255).astype(np.uint8) for side in (normals, -normals))
             self.window.draw(points, *lit)
         image = _shrunk(self.window.image(), self.sampling)
-        fine = self.window.depth() if len(springs) else None  # before anything else is drawn
+        marks = len(springs) or len(panes) or len(dots)
+        fine = self.window.depth() if marks else None  # before anything else is drawn
         if self.guide is not None:
             seen = normals @ self.frame.T
             self.guide.draw(points, *(np.rint(127.5 * (side + 1)).astype(np.uint8) for side in (seen, -seen)))
@@ -90,6 +110,8 @@ class Stage:
             depth = self.window.depth(self.sampling)
             occlude(image, depth, self.guide.depth(), self.guide.image(), tangent, self.reach, step)
         if fine is not None:
+            lay_lines(image, fine, self.camera, edges(panes), LINE_WIDTH, LINE, LINE_OPACITY)
+            self.dots.draw(image, fine, self.camera, dots)
             self.springs.draw(image, fine, self.camera, springs)
         return image
 

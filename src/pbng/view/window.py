@@ -61,6 +61,21 @@ class Window:
         )
         return mesh
 
+    def add_panes(self, n: int) -> None:
+        """Have n panes drawn too, that let things behind them show through and have no depth."""
+        mesh = self.pv.PolyData.from_regular_faces(np.zeros((4 * n, 3), np.float32), np.arange(4 * n).reshape(n, 4))
+        mesh.point_data["color"] = np.full((4 * n, 4), 128, np.uint8)
+        self.plotter.add_mesh(
+            mesh, scalars="color", rgb=True, lighting=False, render=False, reset_camera=False
+        ).force_translucent = True  # fmt: skip
+        self.panes = mesh
+
+    def set_panes(self, panes: np.ndarray, tints: np.ndarray) -> None:
+        """Where the panes are, (n, 4, 3) [m], and their colours and opacities (n, 4) uint8."""
+        self.panes.points = panes.reshape(-1, 3)
+        self.panes.point_data["color"] = np.repeat(tints, 4, axis=0)
+        self.panes.set_active_scalars("color")
+
     def draw(self, points: np.ndarray, outside: np.ndarray, inside: np.ndarray) -> None:
         """Draw points (n, 3) [m] with the colours (n, 3) uint8 of either side."""
         for mesh, color in zip(self.sides, (outside, inside)):
