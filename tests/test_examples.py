@@ -22,6 +22,8 @@ COURSE = [
     ("10_springs", 1.0, 0.01, [], []),
     ("11_motion", 1.0, 1e-3, [], []),
     ("12_cloth", 1.0, 5e-3, [], []),
+    ("13_contact", 1.0, 0.01, [], []),
+    ("14_cloth_on_a_body", 1.0, 0.03, ["blanket.png"], ["pyvista"]),
 ]
 
 

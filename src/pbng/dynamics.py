@@ -132,5 +132,6 @@ class BackwardEuler:
         targets = np.concatenate([self.problem.targets(self.t), ahead[self.free]])
         if self.toucher is None:
             return run(self.method, x, budget, monitor, targets=targets)
-        contacts = self.toucher.find(self.x, x, max(self.t - self.dt, 0.0), self.t, limited=True)
-        return run(self.method, contacts.put_outside(x), budget, monitor, targets=targets, contacts=contacts)
+        contacts = self.toucher.find(self.x, x, max(self.t - self.dt, 0.0), self.t, dt=self.dt)
+        x, other = contacts.put_outside(x), contacts.parted(x, self.problem.fixed)
+        return run(self.method, x, budget, monitor, targets=targets, contacts=contacts, other=other)

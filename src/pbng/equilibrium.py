@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -14,8 +15,7 @@ from pbng.solvers.base import Budget, Method, Monitor, Result, Solver, Status
 from pbng.solvers.loop import run
 from pbng.solvers.pbng import PackedMethod
 
-ROUNDS = 40  # in which contacts are found anew
-FIRST_ROUND = 2  # length of the first, in evaluations of the residual; each further one may be twice as long
+ROUNDS = 100  # in which contacts are found anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +63,7 @@ class Toucher:
         self.detector = Detector(problem.contact, problem.X, problem.fixed)
         self.contacts = Contacts()
         self.size = float(np.linalg.norm(np.ptp(problem.X, axis=0)))
+        self.reach = self.detector.reach
         self.checked = False
         self.began()
 
@@ -72,7 +73,7 @@ class Toucher:
         self.before = self._work()
 
     def find(
-        self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, limited: bool = False, ahead: float = 0.0
+        self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, dt: float | None = None, ahead: float = 0.0
     ) -> Contacts:
         """As :meth:`pbng.contact.detection.Detector.find`, timed."""
         start = time.perf_counter()
@@ -80,7 +81,7 @@ class Toucher:
             self.detector.check(x0)
             self.checked = True
         self.detector.borne = self.method.borne()
-        self.contacts = self.detector.find(x0, x1, t0, t1, limited, ahead)
+        self.contacts = self.detector.find(x0, x1, t0, t1, dt, ahead)
         self.seconds += time.perf_counter() - start
         return self.contacts
 
@@ -158,33 +159,34 @@ def equilibrium(
     """The equilibrium at time t [s], from the state x (n_vert, 3) at time t0.
 
     With contact, the solve goes in rounds: contacts are found at the state that the last round left, and their stencils
-    and normals are those of that state until the next. It has converged when a round begins with a residual that meets
-    the tolerance.
+    and normals are those of that state until the next, which begins when vertices have moved farther than contacts were
+    sought, or when the residual is met. It has converged when a round begins with a residual that meets the tolerance.
     """
     problem = method.problem
     placed, targets = problem.constrain(x, t), problem.targets(t)
     if toucher is None:
         return run(method, placed, budget, monitor, before=x, targets=targets)
     results: list[Result] = []
-    length, left, state = FIRST_ROUND * (budget.every or method.every), budget, placed
-    start, ahead = x, toucher.size  # at first anything may come to touch
+    left, state, start = budget, placed, x
     before: np.ndarray | None = x
+    ahead, far = toucher.size, toucher.reach  # at first anything may come to touch
     for _ in range(ROUNDS):
         contacts = toucher.find(start, state, t0, t, ahead=ahead)
-        part = replace(left, iterations=min(length, left.cap))
-        result = run(method, contacts.put_outside(state), part, monitor, before, targets, contacts, bool(results))
+        state = contacts.put_outside(state)
+        result = run(method, state, left, monitor, before, targets, contacts, bool(results), partial(_far, state, far))
         results.append(result)
         left = _left(budget, results)
-        if not result.status.ok or (result.iterations == 0 and result.status is not Status.ITERATIONS):
+        begun_well = result.iterations == 0 and result.status is not Status.ITERATIONS
+        if not result.status.ok or begun_well or result.status is Status.SECONDS or left.cap == 0:
             break
-        if result.status is Status.ITERATIONS and left.cap == 0:
-            break
-        if result.status is Status.SECONDS:
-            break
-        was, state = state, np.asarray(result.x, float)
-        start, ahead = state, float(np.linalg.norm(state - was, axis=1).max())
-        t0, before, length = t, None, 2 * length
+        state = start = np.asarray(result.x, float)
+        t0, before, ahead = t, None, far
     return joined(results, budget)
+
+
+def _far(x: np.ndarray, far: float, now: np.ndarray) -> bool:
+    """Whether a vertex has moved farther than ``far`` [m] from x (n_vert, 3)."""
+    return float(((now - x) ** 2).sum(1).max(initial=0.0)) > far * far
 
 
 def _left(budget: Budget, results: list[Result]) -> Budget:

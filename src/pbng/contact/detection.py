@@ -2,11 +2,12 @@
 
 Pairs are sought at the start of a step, where surfaces were kept apart by the step before: the side on which a vertex
 lies is then known, and pairs that are farther apart than they can come need not be looked at. Of each vertex the
-closest triangle of another body is taken, and of its own more than a few rings away; of each edge likewise the closest
-edge. A gap that is open costs nothing: contacts act once it closes. So nothing passes through anything else, as long as
-in one step it does not pass by the pair that it was found with.
+closest triangle of another body is taken, and of its own more than a few rings away; of each sharp edge likewise the
+closest edge. A gap that is open costs nothing: contacts act once it closes. So nothing passes through anything else, as
+long as in one step it does not pass by the pair that it was found with.
 """
 
+import math
 import time
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -24,9 +25,11 @@ from pbng.topology import TRIANGLE_EDGES, unique_edges
 
 NEAR = 0.5  # radius, in mean lengths of the edges
 STIFF = 10.0  # default stiffness, in E h of the softer body
-PUSH = 0.1  # how much of the mean length of an edge a contact may push apart in one step of a motion
+PUSH = 5.0  # how many edges a second a stiff contact may push apart what overlaps [1/s]
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
 CREEP = 1e-3  # of the margin: ways shorter than this do not count as sliding
+STEADY = 0.1  # of k_n: tangential stiffness where rounds go on until nothing moves, so that it bears nothing in the end
+SHARP = 0.9  # cosine of the angle between the normals at an edge, below which it counts as sharp
 TOUCHING = 1e-9  # of the radius: closer points have no direction between them
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
 
@@ -63,9 +66,11 @@ class SurfaceDetector:
         self.vertex = s.vertices
         self.body = np.full(len(X), -1, np.int32)  # of each vertex of the surfaces
         self.body[s.triangles] = s.body[:, None]
-        self.edges = unique_edges(s.triangles, TRIANGLE_EDGES)
+        self.solid = np.zeros(n_body, bool)
+        self.solid[np.unique(s.tet_body)] = True
+        self.edges, self.beside = self._sharp_edges(X)
         edge_body = self.body[self.edges[:, 0]]
-        self.beside = _beside(s.triangles, self.edges)
+        self.around = neighbourhoods(s.triangles, len(X), 1)
         self.triangles = BoxTree(X, s.triangles, s.body)
         self.edge_tree = BoxTree(X, self.edges, edge_body)
         self.tets = BoxTree(X, s.tets, s.tet_body) if len(s.tets) else None
@@ -77,16 +82,29 @@ class SurfaceDetector:
             cells = s.triangles, self.edges, s.tets
             self.near_triangles, self.near_edges, self.near_tets = (neighbourhoods(c, len(X), s.rings) for c in cells)
         self.radius = s.radius if s.radius is not None else NEAR * float(s.spacing[present].mean())
-        self.solid = np.zeros(n_body, bool)
-        self.solid[np.unique(s.tet_body)] = True
         # Of each vertex, whether it was inside a solid of others, and of its own; at first nobody knows.
         self.were_inside = [np.ones(len(self.vertex), bool), np.ones(len(self.vertex), bool)]
 
-    def find(self, x0: np.ndarray, x1: np.ndarray, limited: bool, ahead: float) -> Contacts:
+    def _sharp_edges(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Edges that may touch edges, (k, 2), and the two triangles at each.
+
+        Of solids those that are sharp at rest: elsewhere vertices find all there is, and which of many crossing edges
+        is closest changes with every movement. Of cloth all, as it folds anywhere.
+        """
+        edges = unique_edges(self.surfaces.triangles, TRIANGLE_EDGES)
+        beside = _beside(self.surfaces.triangles, edges)
+        a, b = (_area_vectors(X, self.surfaces.triangles[t]) for t in beside.T)
+        cosine = (a * b).sum(1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
+        used = (cosine < SHARP) | ~self.solid[self.body[edges[:, 0]]]
+        return edges[used], beside[used]
+
+    def find(self, x0: np.ndarray, x1: np.ndarray, dt: float | None, ahead: float) -> Contacts:
         """Contacts of a step from x0 to, it is expected, x1 (n_vert, 3), give or take ``ahead`` [m].
 
-        ``limited`` keeps contacts from pushing farther than a share of an edge in this step: with inertia, what is
-        thrust apart at once flies apart.
+        With inertia, in a step of dt [s], contacts do not part at once what overlaps, or it would fly apart: their
+        offset is one at which they push with the stress E, or as far as they may in a step. Without inertia, dt = None,
+        those that resist hold on where they are until they are found anew: nothing else keeps what may slide freely
+        from sliding past what it was found with.
         """
         s = self.surfaces
         x0 = np.ascontiguousarray(x0, float)
@@ -99,13 +117,15 @@ class SurfaceDetector:
             pairs.append(self._vertex_triangle(x0, reach, self.meets_others, None))
         if self.any_own:
             pairs.append(self._vertex_triangle(x0, reach, self.meets_itself, self.near_triangles))
+        if len(self.edges) == 0:
+            return self._contacts(pairs, dt)
         self.edge_tree.refit(x0)
         edge_reach = reach[self.edges].max(1)
         if self.several:  # each pair of bodies from one side: vertices look from both
             pairs.append(self._edge_edge(x0, edge_reach, np.triu(self.meets_others), None))
         if self.any_own:
             pairs.append(self._edge_edge(x0, edge_reach, self.meets_itself, self.near_edges))
-        return self._contacts(pairs, limited)
+        return self._contacts(pairs, dt)
 
     def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Any) -> _Pairs:
         s, vertex = self.surfaces, self.vertex
@@ -116,12 +136,13 @@ class SurfaceDetector:
         triangle[through] = -1
         deep = np.flatnonzero(inside >= 0)
         if len(deep):
-            # What is inside a solid leaves it by the closest of its triangles that it is behind.
+            # What is inside a solid leaves it by the closest of its triangles that it is behind and that it faces.
             only = inside[deep, None] == np.arange(len(s.names))
             v = vertex[deep]
             triangle[deep], weights[deep], _ = closest_triangles(
-                self.triangles, x, x[v], own=np.arange(len(deep)), meets=only, vertex=v, excluded=excluded, behind=True
-            )
+                self.triangles, x, x[v], own=np.arange(len(deep)), meets=only, vertex=v, excluded=excluded, behind=True,
+                against=self._vertex_normals(x, v),
+            )  # fmt: skip
         found = np.flatnonzero(triangle >= 0)
         v, corners = vertex[found], s.triangles[triangle[found]]
         return _Pairs(
@@ -194,12 +215,20 @@ class SurfaceDetector:
         pairs = _Pairs(stencil, weights, first, second, outward, inside, bodies)
         return pairs if excluded is None else pairs.some(~solid | ((ahead > 0) & (back < 0)))
 
+    def _vertex_normals(self, x: np.ndarray, vertex: np.ndarray) -> np.ndarray:
+        """Sum of the area vectors of the triangles around vertices, (k, 3)."""
+        start, triangle = self.around
+        count = np.diff(start)[vertex]
+        first = np.cumsum(count) - count
+        at = np.arange(count.sum()) + np.repeat(start[vertex] - first, count)
+        return np.add.reduceat(_area_vectors(x, self.surfaces.triangles[triangle[at]]), first)
+
     def _edge_normals(self, x: np.ndarray, edge: np.ndarray) -> np.ndarray:
         """Sum of the area vectors of the triangles at edges, (k, 3)."""
         a, b = self.beside[edge].T
         return _area_vectors(x, self.surfaces.triangles[a]) + _area_vectors(x, self.surfaces.triangles[b])
 
-    def _contacts(self, pairs: list[_Pairs], limited: bool) -> Contacts:
+    def _contacts(self, pairs: list[_Pairs], dt: float | None) -> Contacts:
         s = self.surfaces
         p = _Pairs(*(np.concatenate([getattr(q, f.name) for q in pairs]) for f in fields(_Pairs)))
         p = p.some(~self.fixed[p.vertices].all(1))
@@ -212,15 +241,20 @@ class SurfaceDetector:
         gap = sign * distance
         kept = s.skin[p.bodies].sum(1)
         spacing = s.spacing[p.bodies].min(1)
-        k_n = np.full(len(gap), s.k_n) if s.k_n is not None else STIFF * s.stiffness[p.bodies].min(1)
-        offset = np.minimum(kept, gap + PUSH * spacing) if limited else kept
+        softer = s.stiffness[p.bodies].min(1)
+        k_n = np.full(len(gap), s.k_n) if s.k_n is not None else STIFF * softer
+        if dt is None:
+            offset, k_tau = kept, np.maximum(s.k_tau, STEADY * k_n)
+        else:
+            push = np.maximum(PUSH * dt, softer / k_n) * spacing
+            offset, k_tau = np.minimum(kept, gap + push), np.full(len(gap), s.k_tau)
         return Contacts(
             vertices=p.vertices,
             weights=p.weights,
             normal=normal,
             offset=offset,
             k_n=k_n,
-            k_tau=np.where(gap < kept, s.k_tau, 0.0),
+            k_tau=np.where(gap < kept, k_tau, 0.0),
             kept=kept,
         )
 
@@ -281,6 +315,7 @@ class Detector:
         self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
         self.free = spec.surface[~fixed[spec.surface]]
         self.seconds = Seconds()
+        self.reach = self.surfaces.radius if self.surfaces else math.inf  # farther off, directions are of no use [m]
         self.since: tuple[np.ndarray, float] | None = None  # where the last step began, and when [s]
         self.borne = np.zeros((len(X), 3))  # with what force [N] colliders bear each vertex
 
@@ -305,17 +340,17 @@ class Detector:
             self.surfaces.check(x)
 
     def find(
-        self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, limited: bool = False, ahead: float = 0.0
+        self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, dt: float | None = None, ahead: float = 0.0
     ) -> Contacts:
         """Contacts of a step from x0 at time t0 to, it is expected, x1 at t1 (n_vert, 3); see the module.
 
-        ``limited`` is for motion (:meth:`SurfaceDetector.find`); ``ahead`` [m] is how far from x1 vertices may come to
+        ``dt`` is for motion (:meth:`SurfaceDetector.find`); ``ahead`` [m] is how far from x1 vertices may come to
         lie. With t0 = t1 the step goes on in which contacts were sought last: friction counts from where that began.
         """
         if t0 < t1 or self.since is None:
             self.since = x0, t0
         clock = time.perf_counter()
-        found = self.surfaces.find(x0, x1, limited, ahead) if self.surfaces else Contacts()
+        found = self.surfaces.find(x0, x1, dt, ahead) if self.surfaces else Contacts()
         now = time.perf_counter()
         self.seconds.surfaces += now - clock
         touches = [c.touch(x0[self.free], x1[self.free], t0, t1, self.spec.margin + ahead) for c in self.spec.colliders]

@@ -38,6 +38,7 @@ def closest_triangles(
     vertex: np.ndarray | None = None,
     excluded: Excluded | None = None,
     behind: bool = False,
+    against: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The triangle of a tree closest to each point.
 
@@ -48,6 +49,7 @@ def closest_triangles(
         reach: How far to look [m], a number or one a point (k,); below 0 a point is not asked.
         own, meets, vertex, excluded: What may be found, see above.
         behind: Find only triangles that the point is behind: (point - closest point) · normal < 0.
+        against: Directions (k, 3): find only triangles whose normals do not point along them.
 
     Returns:
         Triangles (k,) int32, -1 for none; weights (k, 3) of the closest points; distances (k,) [m], infinite for none.
@@ -57,7 +59,9 @@ def closest_triangles(
     assert excluded is None or vertex is not None, "excluded needs vertex"
     k = len(points)
     found, weights, distance = np.empty(k, np.int32), np.empty((k, 3)), np.empty(k)
-    arrays = (points, np.array([behind], np.int64), found, weights, distance)
+    flags = np.array([behind, against is not None], np.int64)
+    against = np.zeros((1, 3)) if against is None else np.ascontiguousarray(against, np.float64)
+    arrays = (points, flags, found, weights, distance, against)
     each(_closest_triangles, (*_common(tree, 3, x, k, reach, own, meets, vertex, excluded), *arrays), k, GRAIN)
     return found, weights, distance
 
@@ -220,6 +224,7 @@ def _closest_triangles(arguments, low, high):
     own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
     start, ids = array(arguments, 10, np.int64), array(arguments, 11, np.int32)
     points, behind = rows(arguments, 12, 3, np.float64), array(arguments, 13, np.int64)[0]
+    directed, against = array(arguments, 13, np.int64)[1], rows(arguments, 17, 3, np.float64)
     found, weights = array(arguments, 14, np.int32), rows(arguments, 15, 3, np.float64)
     distance = array(arguments, 16, np.float64)
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
@@ -257,6 +262,8 @@ def _closest_triangles(arguments, low, high):
                     if not d2 <= most or d2 > limit or (d2 >= least and t > closest):  # not a number is not found
                         continue
                     if behind and not dot(offset, cross(sub(b, a), sub(c, a))) > 0.0:
+                        continue
+                    if directed and not dot(_point(against, q), cross(sub(b, a), sub(c, a))) <= 0.0:
                         continue
                     if listed and _is_listed(start, ids, vertex[q], t):
                         continue

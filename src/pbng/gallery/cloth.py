@@ -15,7 +15,7 @@ from pbng.solvers.base import Budget
 GRAVITY = (0.0, -9.8, 0.0)  # m/s²
 
 RADIUS = 0.25  # m, of the ball
-EDGE = 1.2  # m, of the cloth that falls on it
+EDGE = 1.0  # m, of the cloth that falls on it
 
 STRIP = 1.6, 0.32  # m
 TURNS, TWIST = 3.0, 3.0  # turns of the two ends against each other, and seconds for them
@@ -34,7 +34,7 @@ def cloth_on_sphere(resolution: int = 48) -> Recipe:
     scene.add(mesh, Membrane(E=500.0, nu=0.3, density=0.2), Bending(1e-4, weighted=True), name="cloth")
     scene.collide_with(Sphere((0.0, -RADIUS, 0.0), RADIUS, thickness=thickness, friction=0.3, name="ball"))
     scene.contact(self_collision=True, thickness=thickness)
-    return Recipe(scene, frames=121, inertia=True, substeps=2, budget=Budget(iterations=60))
+    return Recipe(scene, frames=121, inertia=True, substeps=8, budget=Budget(iterations=20))
 
 
 def hanging_cloth(resolution: int = 32, k_bend: float = 0.0) -> Recipe:

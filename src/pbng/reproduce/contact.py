@@ -1,8 +1,8 @@
 """Figs. 13, 14 and 16 and their rows of Table 3, section 11.2: blocks that collide, shapes and bodies that fall."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +121,7 @@ SIZES: Mapping[str, tuple[str, tuple[tuple[dict[str, Any], int | None], ...]]] =
         "dropping_shapes",
         (
             ({"resolution": 8, "shapes": 12}, 31),
-            ({"resolution": 12, "shapes": 40}, None),
+            ({"resolution": 12, "shapes": 40}, 61),
             ({"resolution": 19, "shapes": 40}, 31),
         ),
     ),
@@ -152,9 +152,7 @@ def _fall(scene: str, options: tuple[tuple[str, Any], ...], most: int | None, th
     budget = Budget(iterations=recipe.budget.iterations, every=SELDOM)
     solver, still = PBNG(threads=threads), np.zeros_like(problem.X)
 
-    def later(at: float) -> Problem:
-        return recipe.scene.compile(True, at)
-
+    later = partial(recipe.scene.compile, True)
     moving = BackwardEuler(problem, solver, 1 / (FPS * steps), problem.X, still, later)
     wanted = set(np.linspace(0, frames - 1, SHOWN).round().astype(int).tolist())
     kept, told, colors = [Frame(0, 0.0, moving.x, moving.look(), problem, moving.v, moving.report())], [], []
@@ -193,7 +191,8 @@ def fig13(settings: Settings) -> Section:
     need_pictures()
     ours, stiff = fall("fig13", settings), fall("fig13", settings, k_n=PAPER_K)
     rows = [*_rows("fig13", ours), *_stiff_rows(ours, stiff)]
-    path = _strip(settings, ours, color="contact", azimuth=18.0, elevation=12.0)
+    path = _strip(settings, ours.frames, color="contact", azimuth=18.0, elevation=12.0)
+    face = _strip(settings, [_left(f) for f in ours.frames], "face.png", color="contact", azimuth=62.0, elevation=12.0)
     return Section(
         name="fig13",
         title="Two blocks colliding",
@@ -203,9 +202,22 @@ def fig13(settings: Settings) -> Section:
         claim="Where vertices collide, dynamic weak constraints are built, which resolve the collision.",
         found=_collided(ours, stiff),
         rows=tuple(rows),
-        pictures=(Picture(path, "The blocks; red are vertices in contact."),),
+        pictures=(
+            Picture(path, "The blocks; red are vertices in contact."),
+            Picture(face, "The left block alone, from where the other one is: red are the vertices that it touches."),
+        ),
         record=_record(ours) | {"paper_k": _record(stiff)},
     )
+
+
+def _left(frame: Frame) -> Frame:
+    """The frame with its first body alone."""
+    problem, contact = frame.problem, frame.contact
+    assert contact is not None
+    own = contact.vertices[contact.vertices < problem.bodies[0].stop]
+    return replace(
+        frame, problem=replace(problem, bodies=problem.bodies[:1]), contact=replace(contact, vertices=own)
+    )  # fmt: skip
 
 
 def fig14(settings: Settings) -> Section:
@@ -221,7 +233,7 @@ def fig14(settings: Settings) -> Section:
         claim="PBNG handles collision-intensive scenes robustly.",
         found=_robust(ours, settings, "fig14"),
         rows=tuple(_rows("fig14", ours)),
-        pictures=(Picture(_strip(settings, ours), "The shapes and the box."),),
+        pictures=(Picture(_strip(settings, ours.frames), "The shapes and the box."),),
         record=_record(ours),
     )
 
@@ -244,7 +256,7 @@ def fig16(settings: Settings) -> Section:
         claim="PBNG handles a large scene with many collisions, in which cloth and solids are coupled.",
         found=_robust(ours, settings, "fig16"),
         rows=tuple(_rows("fig16", ours)),
-        pictures=(Picture(_strip(settings, ours, elevation=10.0), "The bodies, the cloth and the box below."),),
+        pictures=(Picture(_strip(settings, ours.frames, elevation=10.0), "The bodies, the cloth and the box below."),),
         record=_record(ours),
     )
 
@@ -391,11 +403,19 @@ def _upright(ours: Fall) -> str:
     return f" {sentence(f'{most:,}')} tets at most are inverted in a frame, {last:,} in the last."
 
 
-def _strip(settings: Settings, ours: Fall, color: str = "body", azimuth: float = 24.0, elevation: float = 16.0) -> Path:
+def _strip(
+    settings: Settings,
+    frames: Sequence[Frame],
+    name: str = "frames.png",
+    *,
+    color: str = "body",
+    azimuth: float = 24.0,
+    elevation: float = 16.0,
+) -> Path:
     from pbng.view import sheet
 
-    path, frames = file_of(settings, "frames.png"), list(ours.frames)
-    return sheet(frames, path, SHOWN, color=color, azimuth=azimuth, elevation=elevation)
+    path = file_of(settings, name)
+    return sheet(list(frames), path, SHOWN, color=color, azimuth=azimuth, elevation=elevation)
 
 
 def _record(ours: Fall) -> dict[str, Any]:

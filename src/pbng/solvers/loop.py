@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -22,6 +23,8 @@ def run(
     targets: np.ndarray | None = None,
     contacts: Contacts | None = None,
     resume: bool = False,
+    leave: Callable[[np.ndarray], bool] | None = None,
+    other: np.ndarray | None = None,
 ) -> Result:
     """Iterate from x (n_vert, 3), whose prescribed vertices are in place, until the budget says stop.
 
@@ -29,7 +32,8 @@ def run(
     method may then begin at a better state, which it makes from the movement. The clock leaves out compilation. Ctrl-C
     ends the loop with the last state computed. ``targets`` are those of the problem's weak constraints (n_target, 3),
     ``contacts`` what touches during the solve. With ``resume`` x is where the last solve ended, and the method goes on
-    in the precision that it had come to.
+    in the precision that it had come to. Where ``leave`` says so of a monitored state the loop ends, as if the
+    iterations were used up. ``other`` (n_vert, 3) is a state to begin at instead if its energy is lower.
     """
     if budget.error is not None and not method.estimates_error:
         raise InputError(f"Budget(error={budget.error}): this method has no estimate of the error; use MultigridPBNG")
@@ -61,6 +65,10 @@ def run(
         method.start(better, targets, contacts)
         if refined:
             method.refine()
+    if status is None and other is not None:
+        method.start(other, targets, contacts)
+        if not method.certify().energy < history.last.energy:
+            method.start(x, targets, contacts)
     try:
         while status is None:
             if iteration >= budget.cap:
@@ -86,6 +94,8 @@ def run(
                         status, floor, seen = None, method.floor(), (-1, x)
                     if monitor is not None:
                         monitor(_progress(history, tolerance, clock.seconds()))
+                    if status is None and leave is not None and leave(seen[1]):
+                        status = Status.ITERATIONS
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
     if history.monitored[-1] != iteration:

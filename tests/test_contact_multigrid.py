@@ -1,0 +1,66 @@
+"""The two-grid cycle where things touch: its counts stay, and its estimate of the error is true."""
+
+import numpy as np
+import pytest
+
+import pbng
+
+FLESH = pbng.Corotated(E=1e4, nu=0.3, density=100.0)
+
+
+def squeezed(n, friction=0.0):
+    """A ball, its middle held, between two plates that close."""
+    scene = pbng.Scene()
+    ball = scene.add(pbng.shapes.sphere(1.0, n), FLESH, name="ball")
+    scene.pin(ball.where(lambda X: np.linalg.norm(X, axis=1) < 0.25))
+    for side in (-1, 1):
+        motion = pbng.Translate((0, -0.3 * side, 0))
+        plate = pbng.Plane((0, side, 0), (0, -side, 0), motion=motion, over=0.5, friction=friction)
+        scene.collide_with(plate)
+    return scene
+
+
+def stacked(n):
+    """Three soft blocks upon each other, each smaller than the one below, their middles on a line."""
+    scene = pbng.Scene(gravity=(0, -9.8, 0))
+    height = 0.0
+    for k, size in enumerate((1.0, 0.7, 0.45)):
+        mesh = pbng.shapes.box((size, size, size), n, origin=(-size / 2, 0, -size / 2))
+        block = scene.add(mesh, FLESH, name=f"block {k}", at=(0, height + 0.001 * k, 0))
+        if k == 0:
+            scene.pin(block.where(y=0.0))
+        height += size
+    scene.contact()
+    scene.collide_with(pbng.container((-0.6, -1.0, -0.6), (0.6, 4, 0.6)))
+    return scene
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_cycles_do_not_grow_with_the_mesh_in_contact(friction):
+    cycles = []
+    for n in (9, 17):
+        frames = pbng.simulate(squeezed(n, friction), pbng.MultigridPBNG(), pbng.Budget(rtol=1e-3), frames=8)
+        results = [f.result for f in frames]
+        assert all(r.status is pbng.Status.CONVERGED for r in results[1:])
+        cycles.append(np.median([r.iterations for r in results[1:]]))
+    assert cycles[1] <= cycles[0] + 3
+    assert cycles[1] <= 12
+
+
+def test_cycles_of_a_stack():
+    cycles = []
+    for n in (5, 9):
+        result = pbng.solve(stacked(n), pbng.MultigridPBNG(), pbng.Budget(rtol=1e-3))
+        assert result.status is pbng.Status.CONVERGED
+        cycles.append(result.iterations)
+    assert cycles[1] <= 1.5 * cycles[0]
+
+
+@pytest.mark.parametrize("scene", [squeezed(9), squeezed(9, 0.3), stacked(6)], ids=["ball", "rough plates", "stack"])
+def test_the_error_estimate_is_true_in_contact(scene):
+    budget = pbng.Budget(rtol=1e-3)
+    rough = pbng.solve(scene, pbng.MultigridPBNG(), budget)
+    fine = pbng.solve(scene, pbng.PBNG(dtype="float64"), pbng.Budget(rtol=1e-9, iterations=20000), start=rough.x)
+    error = np.linalg.norm(rough.x - fine.x, axis=1).max()
+    assert error <= 3 * rough.error
+    assert rough.error < 0.1
