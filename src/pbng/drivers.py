@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,10 +82,11 @@ def solve(
     Raises:
         InputError: The scene or the start is not usable.
     """
-    problem = scene.compile(at=at or 0.0) if isinstance(scene, Scene) else scene
+    problem = scene.compile() if isinstance(scene, Scene) else scene
+    t = problem.end if at is None else at
+    problem = problem.at(t)
     x, budget = _start(problem, start), budget or Budget()
     method = (solver or default_solver(budget)).set_up(problem)
-    t = problem.end if at is None else at
     toucher = Toucher(problem, method) if problem.contact else None
     return _timed(method, equilibrium(method, toucher, x, 0.0, t, budget, monitor))
 
@@ -130,12 +130,11 @@ def simulate(
     problem = scene.compile(free=inertia) if isinstance(scene, Scene) else scene
     x, budget = _start(problem, start), budget or Budget()
     solver = solver or default_solver(budget)
-    later = partial(scene.compile, inertia) if isinstance(scene, Scene) else None
     if inertia:
         steps = steps_of(fps, dt, substeps)
-        moving = BackwardEuler(problem, solver, 1 / (fps * steps), x, velocities(problem, velocity), later)
+        moving = BackwardEuler(problem, solver, 1 / (fps * steps), x, velocities(problem, velocity))
         return _moving_frames(moving, steps, budget, frames, monitor)
-    return _frames(Equilibria(problem, solver, x, later), budget, frames, fps, monitor)
+    return _frames(Equilibria(problem, solver, x), budget, frames, fps, monitor)
 
 
 def default_solver(budget: Budget) -> Solver:

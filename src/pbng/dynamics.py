@@ -1,7 +1,6 @@
 """Backward Euler: each step minimises the incremental potential ½ Σ m/Δt² |x - x̂|² + PE(x), x̂ = x + Δt v."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -57,22 +56,13 @@ class BackwardEuler:
         solver: What solves each step.
         dt: Time step [s].
         x, v: The state at time 0; prescribed vertices are put in place.
-        later: Makes the problem that holds from a time on, where vertices are let go: ``later(at=t)``.
 
     Raises:
         InputError: dt is not positive, or a free vertex has no mass.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        solver: Solver,
-        dt: float,
-        x: np.ndarray,
-        v: np.ndarray,
-        later: Callable[..., Problem] | None = None,
-    ) -> None:
-        self.solver, self.dt, self.later, self.step_number = solver, dt, later, 0
+    def __init__(self, problem: Problem, solver: Solver, dt: float, x: np.ndarray, v: np.ndarray) -> None:
+        self.solver, self.dt, self.step_number = solver, dt, 0
         self._take(problem)
         self.x, self.v = problem.constrain(x, 0.0), v
         held = problem.fixed
@@ -95,8 +85,8 @@ class BackwardEuler:
 
     def step(self, budget: Budget, monitor: Monitor | None = None) -> Result:
         """Take one step; a result that is not finite or was interrupted leaves the state as it was."""
-        if self.later is not None and self.t >= self.problem.until - 1e-6 * self.dt:
-            self._take(self.later(at=self.t + 1e-6 * self.dt))
+        if (problem := self.problem.at(self.t + 1e-6 * self.dt)) is not self.problem:
+            self._take(problem)
         ahead = self.x + self.dt * self.v
         self.step_number += 1
         result = self._run(self.problem.constrain(ahead, self.t), ahead, budget, monitor)

@@ -1,7 +1,6 @@
 """One equilibrium, with what touches found anew in rounds until it no longer changes."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -119,16 +118,13 @@ class Equilibria:
     """Equilibria at one time after another, each from the one before.
 
     Args:
-        problem: What is solved, until ``problem.until``.
+        problem: What is solved, or what comes after it.
         solver: What solves it.
         x: Where to start from, (n_vert, 3) [m].
-        later: Makes the problem that holds from a time on: ``later(at=t)``.
     """
 
-    def __init__(
-        self, problem: Problem, solver: Solver, x: np.ndarray, later: Callable[..., Problem] | None = None
-    ) -> None:
-        self.solver, self.later, self.x, self.t = solver, later, x, 0.0
+    def __init__(self, problem: Problem, solver: Solver, x: np.ndarray) -> None:
+        self.solver, self.x, self.t = solver, x, 0.0
         self._take(problem)
 
     def _take(self, problem: Problem) -> None:
@@ -137,8 +133,8 @@ class Equilibria:
 
     def at(self, t: float, budget: Budget, monitor: Monitor | None) -> tuple[Result, ContactReport | None]:
         """The equilibrium at time t [s], and what touches there."""
-        if self.later is not None and t >= self.problem.until:
-            self._take(self.later(at=t))
+        if (problem := self.problem.at(t)) is not self.problem:
+            self._take(problem)
         if self.toucher:
             self.toucher.began()
         result = equilibrium(self.method, self.toucher, self.x, self.t, t, budget, monitor)

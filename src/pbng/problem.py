@@ -90,7 +90,7 @@ class Problem:
         weak: Weak constraints, by size of their stencils.
         dt: Time step [s] of a problem of backward Euler (:meth:`dynamic`), else None.
         contact: What may touch, if anything may; where it does is no part of the problem.
-        until: Time [s] at which some vertices are let go, and the scene compiles to another problem.
+        until: Time [s] at which some vertices are let go; from then on the problem is ``after``.
 
     What evaluates something takes ``targets`` (n_target, 3) [m], the points in space that weak constraints end at,
     by default those at the end of every motion.
@@ -109,6 +109,11 @@ class Problem:
     dt: float | None = None
     contact: ContactSpec | None = None
     until: float = math.inf
+    after: "Problem | None" = None
+
+    def at(self, t: float) -> "Problem":
+        """The problem that holds at time t [s]."""
+        return self if self.after is None or t < self.until else self.after.at(t)
 
     @property
     def n_vert(self) -> int:

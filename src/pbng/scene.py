@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -219,7 +219,8 @@ class Scene:
             bodies: Which; by default all that the scene has when it compiles.
             k_n: Stiffness along the normal [N/m]; by default ten times the E h of the softer body.
             k_tau: Stiffness across it [N/m]: 0 slides, more holds on like friction while there is contact.
-            radius: Distance [m] below which surfaces count as close; by default half the mean length of their edges.
+            radius: Distance [m] below which surfaces count as close; by default half the mean length of their edges, or
+                with inertia a tenth, and what they move in a step besides.
             thickness: Distance [m] that is kept; by default none between solids, and for cloth that of its material or
                 a fifth of the mean length of its edges.
             self_collision: Whether bodies collide with themselves, or which do.
@@ -270,12 +271,8 @@ class Scene:
         if not any(b is body for b in self.bodies):
             raise InputError(f"{what}: body {body.name!r} belongs to another scene")
 
-    def compile(self, free: bool = False, at: float = 0.0) -> Problem:
-        """The discrete problem of this scene as it now stands.
-
-        Args:
-            free: Whether nothing need hold a body.
-            at: Time [s] at which it holds: pins and moves that have ended are left out.
+    def compile(self, free: bool = False) -> Problem:
+        """The discrete problem of this scene as it now stands; ``free`` allows that nothing holds a body.
 
         Raises:
             InputError: There is no body, nothing is held, or selections of moves overlap in part.
@@ -301,36 +298,45 @@ class Scene:
         for b in self.bodies:
             if isinstance(b.mesh, TriMesh) and not b.is_cloth:
                 f_ext[b.start : b.start + b.mesh.n_vert, 2] = 0  # plane strain: z never moves
-        moves = self._moves_at(at)
-        prescribed = _Prescribed(X, moves)
-        fixed = np.zeros(len(X), bool)
-        fixed[prescribed.index] = True
         weak = weak_constraints(self._bindings)
-        if not (free or self.colliders or fixed.any() or any(w.anchored for w in weak)):
+        phases = self._phases(X)
+        if not (free or self.colliders or phases[0][0].any() or any(w.anchored for w in weak)):
             raise InputError("no vertex is pinned or moved: the equilibrium is not unique; pin a part of each body")
         problem = Problem(
             name=self.name,
             X=X,
             groups=tuple(ElementGroup(kind, m, np.concatenate(cells)) for (kind, m), cells in groups.items()),
             bodies=tuple(BodyRange(b.name, b.start, b.start + b.mesh.n_vert, b.mesh) for b in self.bodies),
-            fixed=fixed,
-            prescribed=prescribed,
+            fixed=phases[-1][0],
+            prescribed=phases[-1][1],
             f_ext=f_ext,
             mass=mass,
             end=max(
                 [
-                    prescribed.end,
+                    *(end for _, prescribed, until in phases for end in (prescribed.end, until) if end < math.inf),
                     *(c.end for c in self.colliders),
                     *(b.targets.end for b in self._bindings if isinstance(b.targets, _Prescribed)),
                 ]
             ),
             weak=weak,
             contact=contact_spec(self.bodies, self._contact, self.colliders),
-            until=min((m.until for m in moves), default=math.inf),
         )
+        for fixed, prescribed, until in phases[-2::-1]:
+            problem = replace(problem, fixed=fixed, prescribed=prescribed, until=until, after=problem)
         if not free:
             self._warn_of_loose_parts(problem)
         return problem
+
+    def _phases(self, X: np.ndarray) -> list[tuple[np.ndarray, "_Prescribed", float]]:
+        """Which vertices are prescribed, where they are, and until when [s]: one after another."""
+        phases, t = [], 0.0
+        while t < math.inf:
+            moves = self._moves_at(t)
+            prescribed, fixed = _Prescribed(X, moves), np.zeros(len(X), bool)
+            fixed[prescribed.index] = True
+            t = min((m.until for m in moves), default=math.inf)
+            phases.append((fixed, prescribed, t))
+        return phases
 
     def _moves_at(self, t: float) -> list[_Move]:
         """The pins and moves that hold at time t [s], and pins of the rest of the bodies that wait."""

@@ -24,6 +24,7 @@ from pbng.errors import InputError
 from pbng.topology import TRIANGLE_EDGES, unique_edges
 
 NEAR = 0.5  # radius, in mean lengths of the edges
+CLOSE = 0.1  # the same in a step of a motion, to which twice what the step is expected to move is added
 STIFF = 10.0  # default stiffness, in E h of the softer body
 PUSH = 5.0  # how many edges a second a stiff contact may push apart what overlaps [1/s]
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
@@ -110,7 +111,10 @@ class SurfaceDetector:
         x0 = np.ascontiguousarray(x0, float)
         moved = np.linalg.norm(x1 - x0, axis=1)
         most = float(moved[self.vertex].max(initial=0.0))
-        reach = self.radius + 2 * float(s.skin.max(initial=0.0)) + moved + most + min(ahead, AHEAD * self.radius)
+        radius = self.radius + min(ahead, AHEAD * self.radius)
+        if dt is not None and s.radius is None:
+            radius = CLOSE / NEAR * self.radius + moved + most
+        reach = radius + 2 * float(s.skin.max(initial=0.0)) + moved + most
         self.triangles.refit(x0)
         pairs = []
         if self.several:
@@ -353,7 +357,10 @@ class Detector:
         found = self.surfaces.find(x0, x1, dt, ahead) if self.surfaces else Contacts()
         now = time.perf_counter()
         self.seconds.surfaces += now - clock
-        touches = [c.touch(x0[self.free], x1[self.free], t0, t1, self.spec.margin + ahead) for c in self.spec.colliders]
+        before, after, near = x0[self.free], x1[self.free], np.asarray(self.spec.margin + ahead)
+        if dt is not None:
+            near = CLOSE / NEAR * self.spec.margin + np.linalg.norm(after - before, axis=1)
+        touches = [c.touch(before, after, t0, t1, near) for c in self.spec.colliders]
         if touches:
             normal = np.concatenate([t.normal for t in touches])
             vertex = self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32)

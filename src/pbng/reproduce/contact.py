@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -151,9 +151,7 @@ def _fall(scene: str, options: tuple[tuple[str, Any], ...], most: int | None, th
     problem = recipe.scene.compile(free=True)
     budget = Budget(iterations=recipe.budget.iterations, every=SELDOM)
     solver, still = PBNG(threads=threads), np.zeros_like(problem.X)
-
-    later = partial(recipe.scene.compile, True)
-    moving = BackwardEuler(problem, solver, 1 / (FPS * steps), problem.X, still, later)
+    moving = BackwardEuler(problem, solver, 1 / (FPS * steps), problem.X, still)
     wanted = set(np.linspace(0, frames - 1, SHOWN).round().astype(int).tolist())
     kept, told, colors = [Frame(0, 0.0, moving.x, moving.look(), problem, moving.v, moving.report())], [], []
     for k in range(1, frames):
