@@ -12,10 +12,12 @@ def cube(scene, name="cube", **options):
     return scene.add(pbng.shapes.box((0.2, 0.2, 0.2), 3), RUBBER, name=name, **options)
 
 
-def test_what_is_let_go_falls_freely():
+@pytest.mark.parametrize("compiled", [False, True])
+def test_what_is_let_go_falls_freely(compiled):
     scene = pbng.Scene(gravity=(0, -9.8, 0))
     body = cube(scene)
     scene.pin(body.where(), until=0.5)
+    scene = scene.compile(free=True) if compiled else scene
     frames = list(
         pbng.simulate(scene, pbng.PBNG(), pbng.Budget(rtol=1e-6), frames=11, fps=10, inertia=True, substeps=5)
     )

@@ -116,18 +116,19 @@ class SurfaceDetector:
             radius = CLOSE / NEAR * self.radius + moved + most
         reach = radius + 2 * float(s.skin.max(initial=0.0)) + moved + most
         self.triangles.refit(x0)
+        if len(self.edges):
+            self.edge_tree.refit(x0)
+        edge_reach = reach[self.edges].max(1)
         pairs = []
         if self.several:
             pairs.append(self._vertex_triangle(x0, reach, self.meets_others, None))
-        if self.any_own:
-            pairs.append(self._vertex_triangle(x0, reach, self.meets_itself, self.near_triangles))
-        if len(self.edges) == 0:
-            return self._contacts(pairs, dt)
-        self.edge_tree.refit(x0)
-        edge_reach = reach[self.edges].max(1)
-        if self.several:  # each pair of bodies from one side: vertices look from both
+            # Edges of each pair of bodies are sought from one side: vertices look from both.
             pairs.append(self._edge_edge(x0, edge_reach, np.triu(self.meets_others), None))
         if self.any_own:
+            pairs.append(self._vertex_triangle(x0, reach, self.meets_itself, self.near_triangles))
+            seen = np.zeros(len(x0), bool)  # where a surface comes near itself, vertices tell
+            seen[pairs[-1].vertices] = True
+            edge_reach[~seen[self.edges].any(1)] = -1.0
             pairs.append(self._edge_edge(x0, edge_reach, self.meets_itself, self.near_edges))
         return self._contacts(pairs, dt)
 
