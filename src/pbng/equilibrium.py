@@ -11,7 +11,7 @@ from pbng.contact.detection import Detector
 from pbng.errors import InputError
 from pbng.problem import Problem
 from pbng.solvers.base import Budget, Method, Monitor, Result, Solver, Status
-from pbng.solvers.loop import run
+from pbng.solvers.loop import SAFETY, run
 from pbng.solvers.pbng import PackedMethod
 
 ROUNDS = 100  # in which contacts are found anew
@@ -156,7 +156,8 @@ def equilibrium(
 
     With contact, the solve goes in rounds: contacts are found at the state that the last round left, and their stencils
     and normals are those of that state until the next, which begins when vertices have moved farther than contacts were
-    sought, or when the residual is met. It has converged when a round begins with a residual that meets the tolerance.
+    sought, or when the residual is met. It has converged when a round begins with a residual that meets the tolerance,
+    or moves nothing by as much as the error that is asked for.
     """
     problem = method.problem
     placed, targets = problem.constrain(x, t), problem.targets(t)
@@ -172,10 +173,13 @@ def equilibrium(
         result = run(method, state, left, monitor, before, targets, contacts, bool(results), partial(_far, state, far))
         results.append(result)
         left = _left(budget, results)
-        begun_well = result.iterations == 0 and result.status is not Status.ITERATIONS
-        if not result.status.ok or begun_well or result.status is Status.SECONDS or left.cap == 0:
+        settled = result.iterations == 0 and result.status is not Status.ITERATIONS
+        now = np.asarray(result.x, float)
+        if budget.error is not None and result.status is Status.CONVERGED:
+            settled |= not _far(state, budget.error / SAFETY, now)
+        if not result.status.ok or settled or result.status is Status.SECONDS or left.cap == 0:
             break
-        state = start = np.asarray(result.x, float)
+        state = start = now
         t0, before, ahead = t, None, far
     return joined(results, budget)
 

@@ -110,21 +110,20 @@ class ContactNodes:
         contact, which = np.repeat(np.arange(m), 4), np.tile(np.arange(4), m)
         mine = np.flatnonzero(~self.problem.fixed[corner] & (c.weights.ravel() != 0))
         contact, which = contact[mine], which[mine]
-        own = np.concatenate([corner[mine], c.vertex[~self.problem.fixed[c.vertex]]])
         walls = np.flatnonzero(~self.problem.fixed[c.vertex])
+        own = np.concatenate([corner[mine], c.vertex[walls]])
         rest = (which[:, None] + np.arange(1, 4)) % 4
         row = np.zeros((len(own), ROW))
         n = len(mine)
         row[:n, 0] = c.weights[contact, which]
         row[:n, 2:5] = c.weights[contact[:, None], rest]
         row[:n, 5:8] = c.normal[contact]
-        # Offsets hold for absolute positions only where weights do not sum to zero.
         row[:n, 8] = c.offset[contact]
         row[:n, 9] = 1 / c.k_n[contact]
         row[:n, 10] = c.k_tau[contact]
         row[n:, 0] = row[n:, 1] = 1
         row[n:, 5:8] = c.plane[walls]
-        row[n:, 8] = c.level[walls] - c.plane[walls] @ packed.origin
+        row[n:, 8] = c.level[walls] - c.plane[walls] @ packed.origin  # of contacts, weights sum to zero
         row[n:, 11] = c.friction[walls]
         row[n:, 12:] = c.anchor[walls] - packed.origin
         other = np.zeros((len(own), 3), np.uint32)
@@ -133,10 +132,8 @@ class ContactNodes:
         order = np.argsort(own, kind="stable")
         count = np.bincount(own, minlength=self.problem.n_vert)
         first = np.concatenate([[0], np.cumsum(count)])
-        lanes = self.owner[self.real] if len(self.node) else np.empty(0, np.int64)
-        per_lane = np.zeros(len(self.real) if len(self.node) else 0, np.int64)
-        if len(self.node):
-            per_lane[self.real] = count[lanes]
+        lanes, per_lane = self.owner[self.real], np.zeros(len(self.real), np.int64)
+        per_lane[self.real] = count[lanes]
         self.first = np.concatenate([[0], np.cumsum(per_lane)])
         at = np.repeat(first[lanes], count[lanes]) + _counting(count[lanes])
         taken = order[at]
@@ -145,8 +142,6 @@ class ContactNodes:
 
     def sweep(self, x: np.ndarray, omega: float) -> None:
         """Update every node in contact once, in place."""
-        if len(self.node) == 0:
-            return
         p, r = self.packed, self.rows
         arrays = (
             x, r.seg_start, r.seg, r.idx, r.coef, r.nodal, p.parameters, np.array([omega, self.creep], p.dtype),
