@@ -4,12 +4,15 @@ Smoothing is block Gauss-Seidel, forwards before the coarser grid and backwards 
 symmetric; the coarsest grid is solved by a factorisation.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 from threadpoolctl import ThreadpoolController
 
+from pbng.coarse.cloth import Restriction
 from pbng.coarse.grid import Grid
 from pbng.jit import serial
 from pbng.linalg import adjugate, scale
@@ -18,6 +21,7 @@ from pbng.parallel import array, body, each, rows
 # On few cores threads of BLAS only get in the way of Numba's, and their number would show in the last bits.
 _blas = ThreadpoolController()
 SHIFT = 1e-6  # of each diagonal block: few elements may leave directions of a piece free, or a whole body loose
+MOST, MOST_CLOTH = 30, 100  # iterations of conjugate gradients
 DENSE = 400  # unknowns up to which the coarsest matrix is factorised as a dense one
 
 
@@ -27,14 +31,20 @@ class BlockMatrix:
     Args:
         node: Nodes of the pieces, (n_piece, 8).
         n_node: Number of nodes.
+        loose: n_node * row + column of blocks that are given each time, as those of cloth are; rising.
     """
 
-    def __init__(self, node: np.ndarray, n_node: int) -> None:
+    def __init__(self, node: np.ndarray, n_node: int, loose: np.ndarray | None = None) -> None:
         self.n_node = n_node
+        self.loose = np.empty(0, np.int64) if loose is None else loose
         key = (node[:, :, None].astype(np.int64) * n_node + node[:, None, :]).ravel()
         order = np.argsort(key, kind="stable")
         self.key = key[order]
-        self.own = self.key[np.flatnonzero(np.concatenate([[True], self.key[1:] != self.key[:-1]]))]
+        self.own = (
+            self.key[np.flatnonzero(np.concatenate([[True], self.key[1:] != self.key[:-1]]))] if order.size else key
+        )
+        if len(self.loose):
+            self.own = np.unique(np.concatenate([self.own, self.loose, np.arange(n_node) * (n_node + 1)]))
         piece, a, b = order // 64, order // 8 % 8, order % 8
         self.source = 576 * piece + 24 * a + b  # where a block's first entry is in the stiffness
         self.inverse = np.empty((n_node, 9))
@@ -47,6 +57,7 @@ class BlockMatrix:
             more = np.repeat(np.arange(n), np.diff(constant.indptr)) * n + constant.indices
             present = np.union1d(present, more)
         self.source_start = np.append(np.searchsorted(self.key, present), len(self.key))
+        self.loose_at = np.searchsorted(present, self.loose)
         self.column = (present % n).astype(np.int32)
         self.start = np.searchsorted(present // n, np.arange(n + 1))
         self.diagonal = np.flatnonzero(present // n == self.column)
@@ -56,9 +67,12 @@ class BlockMatrix:
             self.constant = np.zeros((len(present), 9))
             self.constant[np.searchsorted(present, more)] = constant.data.reshape(-1, 9)
 
-    def assemble(self, stiffness: np.ndarray, least: np.ndarray) -> None:
-        """Sum stiffness (n_piece, 3, 8, 3, 8), with diagonal blocks no weaker than ``least`` (n_node,) [N/m]."""
+    def assemble(self, stiffness: np.ndarray, least: np.ndarray, loose: np.ndarray | None = None) -> None:
+        """Sum stiffness (n_piece, 3, 8, 3, 8) and loose blocks (n_loose, 9), with diagonal blocks no weaker than
+        ``least`` (n_node,) [N/m]."""
         each(_gather, (self.source_start, self.source, stiffness, self.value), len(self.value), grain=1024)
+        if loose is not None:
+            self.value[self.loose_at] += loose
         _raise_diagonal(self.diagonal, self.value, least)
         if self.constant is not None:
             self.value += self.constant
@@ -74,16 +88,43 @@ class BlockMatrix:
         return scipy.sparse.bsr_matrix((self.value.reshape(-1, 3, 3), self.column, self.start), shape=(3 * n, 3 * n))
 
 
+@dataclass(frozen=True, eq=False)
+class Level:
+    """A level finer than all grids, of nodes of the finest grid and of vertices.
+
+    Attributes:
+        up: Weights (n, n_node) of the nodes of the finest grid at its nodes.
+        piece: Which of that grid's pieces it has, (k,).
+        node: Its nodes of these, (k, 8).
+        keys: n * row + column of the blocks of cloth, rising.
+    """
+
+    up: scipy.sparse.csr_matrix
+    piece: np.ndarray
+    node: np.ndarray
+    keys: np.ndarray
+
+
 class GridSolver:
-    """Solves with the matrix of the finest of some grids.
+    """Solves with the matrix of the finest of some grids, or of a level above them.
 
     Args:
         grids: From fine to coarse, at least one.
+        top: The level above, if there is one.
     """
 
-    def __init__(self, grids: list[Grid]) -> None:
+    def __init__(self, grids: list[Grid], top: Level | None = None) -> None:
         self.up = [interpolation(coarse) for coarse in grids[1:]]
-        self.matrices = [BlockMatrix(g.node, g.n_node) for g in grids]
+        self.top, self.restrictions = top, []
+        if top is None:
+            self.matrices = [BlockMatrix(g.node, g.n_node) for g in grids]
+        else:
+            self.up.insert(0, top.up)
+            self.matrices, keys = [BlockMatrix(top.node, top.up.shape[0], top.keys)], top.keys
+            for grid, up in zip(grids, self.up):
+                self.restrictions.append(Restriction(keys, up))
+                keys = self.restrictions[-1].keys
+                self.matrices.append(BlockMatrix(grid.node, grid.n_node, keys))
         self.down = [u.T.tocsr() for u in self.up]
         self.split = np.cumsum([len(g.node) for g in grids])[:-1]
 
@@ -96,10 +137,27 @@ class GridSolver:
                 hessian = (up.T @ hessian @ up).tobsr((3, 3))
 
     @_blas.wrap(limits=1, user_api="blas")
-    def factorise(self, stiffness: np.ndarray, least: list[np.ndarray]) -> None:
-        """Take the stiffness (n_piece, 3, 8, 3, 8) of the pieces of all grids, numbered through."""
-        for matrix, part, low in zip(self.matrices, np.split(stiffness, self.split), least):
-            matrix.assemble(part, low)
+    def factorise(
+        self,
+        stiffness: np.ndarray,
+        least: list[np.ndarray],
+        cloth: np.ndarray | None = None,
+        exact: np.ndarray | None = None,
+    ) -> None:
+        """Take the stiffness (n_piece, 3, 8, 3, 8) of the pieces of all grids, numbered through, and blocks of cloth,
+        made positive definite and exact."""
+        parts = np.split(stiffness, self.split)
+        if self.top is not None:
+            parts.insert(0, parts[0][self.top.piece])
+        definite = cloth
+        for level, (matrix, part, low) in enumerate(zip(self.matrices, parts, least)):
+            matrix.assemble(part, low, cloth)
+            if cloth is not None and level < len(self.restrictions):
+                cloth = self.restrictions[level](cloth)
+        if exact is not None:
+            m = self.matrices[0]
+            self.exact = m.value.copy()
+            self.exact[m.loose_at] += exact - definite
         coarsest = self.matrices[-1].sparse()
         if coarsest.shape[0] <= DENSE:
             factor = scipy.linalg.cho_factor(coarsest.toarray(), lower=True, overwrite_a=True, check_finite=False)
@@ -117,20 +175,35 @@ class GridSolver:
         _gauss_seidel(m.start, m.column, m.value, m.inverse, b, x, True)
         return x
 
-    @_blas.wrap(limits=1, user_api="blas")
-    def solve(self, b: np.ndarray, tolerance: float, most: int = 30) -> np.ndarray:
+    def solve(self, b: np.ndarray, tolerance: float, most: int | None = None) -> np.ndarray:
         """Conjugate gradients until the residual, measured by the V-cycle, has fallen by ``tolerance``."""
+        x = self._solve(b, tolerance, most, self.matrices[0].value)
+        assert x is not None
+        return x
+
+    def solve_exact(self, b: np.ndarray, tolerance: float, most: int | None = None) -> np.ndarray | None:
+        """The same with cloth's exact Hessian; None if it is found not to be positive definite."""
+        return self._solve(b, tolerance, most, self.exact, True)
+
+    @_blas.wrap(limits=1, user_api="blas")
+    def _solve(
+        self, b: np.ndarray, tolerance: float, most: int | None, value: np.ndarray, may_fail: bool = False
+    ) -> np.ndarray | None:
         if not self.up:
             return self.cycle(b)
-        x, r = np.zeros_like(b), b.copy()
+        m = self.matrices[0]
+        x, r, q = np.zeros_like(b), b.copy(), np.empty_like(b)
         z = self.cycle(r)
         p, rz = z.copy(), float(np.vdot(r, z))
         first = rz
-        for _ in range(most):
+        for _ in range(most or (MOST_CLOTH if self.top else MOST)):
             if not rz > 0:
                 break
-            q = self.matrices[0] @ p
-            alpha = rz / float(np.vdot(p, q))
+            each(_multiply, (m.start, m.column, value, p, q), len(p), grain=256)
+            curvature = float(np.vdot(p, q))
+            if may_fail and not curvature > 0:
+                return None
+            alpha = rz / curvature
             x += alpha * p
             r -= alpha * q
             z = self.cycle(r)

@@ -1,4 +1,4 @@
-"""A nonlinear two-grid cycle for solids: sweeps of PBNG, and a correction from a coarse space (docs/method.md).
+"""A nonlinear two-grid cycle: sweeps of PBNG, and a correction from a coarse space (docs/method.md).
 
 One cycle, from the state x::
 
@@ -7,17 +7,20 @@ One cycle, from the state x::
     solve UᵀHU y = Uᵀ f(g) roughly, by conjugate gradients with a V-cycle
     z = g + α U y, α = 1 unless the energy says otherwise
     m = Anderson's mixture of the last cycles; x = m if E(m) <= E(z), else z
+
+Of cloth the coarse space holds every vertex: there U = 1, and a correction is a step of Newton's method that the grids
+precondition.
 """
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from pbng.coarse.space import coarse_space
+from pbng.coarse.space import CoarseSpace
 from pbng.errors import InputError
 from pbng.jit import compile_seconds
 from pbng.materials.base import Material
@@ -28,25 +31,30 @@ from pbng.solvers.pbng import PBNG, PackedMethod, checked_dtype
 from pbng.solvers.threads import check_threads
 
 DECREASE = 1e-4  # of f·Uy: what a correction must lower the energy by
-BACKTRACKS = 6
+BACKTRACKS, BACKTRACKS_CLOTH = 6, 10  # cloth that lies flat does not resist at first, and then all the more
 SHRINK = 0.5
 SLOWEST = 0.9  # rate of convergence that an estimate of the error supposes at most
 TOO_LITTLE = 10  # how much larger than a Newton step it supposes the error to be, at most
+NEAR_SADDLES = 0.98, 50  # the same two where the Hessian of cloth is found indefinite, as while it buckles
+CLOTH_SWEEPS = 10  # a cycle of cloth: they cost little beside the rest
 COARSE_TOLERANCE = 0.1  # rougher solves save nothing and cost cycles below 1e-4
 
 
 @dataclass(frozen=True)
 class MultigridPBNG:
-    """PBNG with a coarse space: its number of cycles does not grow with the mesh. For solids; cloth is only swept.
+    """PBNG with a coarse space: its number of cycles does not grow with the mesh.
+
+    Cloth takes Newton's steps on all its vertices; without stiffness against bending it may take more of them on finer
+    meshes, as ever finer folds come and go.
 
     Args:
-        sweeps: Sweeps a cycle; by default 4, and 8 where a material is nearly incompressible (λ > 10 μ).
+        sweeps: Sweeps a cycle; by default 4, 8 where a material is nearly incompressible (λ > 10 μ), 10 with cloth.
         omega: Their relaxation, in (0, 2).
         memory: Cycles that Anderson's mixing looks back on; 0 for none.
         start: "extend" to begin with the movement of the prescribed vertices extended over the grid, if that lowers the
             energy, or "previous" to leave the free vertices where they are.
         dtype: Precision of the sweeps, "float32", "float64" or "auto": float32 until rounding keeps the residual from
-            falling further, then float64. Residuals and energies are always float64.
+            falling further, then float64 (for cloth alone, from the start). Residuals and energies are always float64.
         threads: Threads; by default as many as prove fastest, up to all that Numba has. Results do not depend on it.
     """
 
@@ -86,14 +94,18 @@ class TwoGrid(PackedMethod):
     estimates_error = True
 
     def __init__(self, problem: Problem, solver: MultigridPBNG) -> None:
+        cloth = [not g.kind.solid for g in problem.groups]
+        if all(cloth) and solver.dtype == "auto":  # float32 saves little where sweeps are the least part of a cycle
+            solver = replace(solver, dtype="float64")
         super().__init__(problem, solver.smoother())
         self.cycle = solver
         start = time.perf_counter() - compile_seconds()
         with self.threads.used():
-            self.coarse = coarse_space(problem, self.packed)
+            self.coarse = CoarseSpace(problem, self.packed)
         self.setup_seconds += time.perf_counter() - compile_seconds() - start
         stiff = any(m.lam > 10 * m.mu for m in (g.material for g in problem.groups) if isinstance(m, Material))
-        self.times = solver.sweeps or (8 if stiff else 4)
+        self.backtracks = BACKTRACKS_CLOTH if any(cloth) else BACKTRACKS
+        self.times = solver.sweeps or (CLOTH_SWEEPS if any(cloth) else 8 if stiff else 4)
         self.d = np.zeros(self.n_free)
         stiffness = self.stiffness
         self.compliance = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
@@ -116,6 +128,7 @@ class TwoGrid(PackedMethod):
         self.E = self.energy(self.x)
         self.softness = Softness(self.cycle.omega)
         self.refreshed = False
+        self.coarse.restart()
         self.moved: list[float] = []  # largest movement of a vertex in each of the last three cycles [m]
 
     def step(self) -> None:
@@ -153,7 +166,7 @@ class TwoGrid(PackedMethod):
         if self.rises(Eg, self.E, self.x):
             self._tread_softly()
             return
-        for _ in range(BACKTRACKS):
+        for _ in range(self.backtracks):
             # A large rotation, taken along a line, stretches every element; a few sweeps undo that.
             self.apply(z, self.softness.omega)
             self.Ez = self.energy(z)
@@ -199,9 +212,10 @@ class TwoGrid(PackedMethod):
         self.coarse.direction(f, self.d, COARSE_TOLERANCE)
         newton = _longest(self.d + f * np.repeat(self.compliance, 4))
         rates = [b / a for a, b in pairwise(self.moved) if a > 0]
-        rate = min(max(rates, default=0.5), SLOWEST)
+        slowest, too_little = (SLOWEST, TOO_LITTLE) if self.coarse.definite else NEAR_SADDLES
+        rate = min(max(rates, default=0.5), slowest)
         to_come = self.moved[-1] * rate / (1 - rate) if self.moved else 0.0
-        return max(newton, min(to_come, TOO_LITTLE * newton))
+        return max(newton, min(to_come, too_little * newton))
 
 
 def _longest(x: np.ndarray) -> float:
