@@ -1,8 +1,9 @@
 """One equilibrium, with what touches found anew in rounds until it no longer changes."""
 
+import math
 import time
 from dataclasses import dataclass, replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,13 @@ from pbng.solvers.base import Budget, Method, Monitor, Result, Solver, Status
 from pbng.solvers.loop import SAFETY, run
 from pbng.solvers.pbng import PackedMethod
 
-ROUNDS = 100  # in which contacts are found anew
+ROUNDS, LATELY = 100, 10  # in which contacts are found anew; of these, how many may bring nothing
+SLOWEST = 0.9  # rate at which rounds are supposed to move less and less, at most
+HOLD, EASE, LEAST_HOLD = (
+    0.1,
+    0.5,
+    1e-3,
+)  # of k_n: how contacts hold on in the first round, less in each further, at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,16 +78,14 @@ class Toucher:
         self.since, self.seconds = time.perf_counter(), 0.0
         self.before = self._work()
 
-    def find(
-        self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, dt: float | None = None, ahead: float = 0.0
-    ) -> Contacts:
+    def find(self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, **options: Any) -> Contacts:
         """As :meth:`pbng.contact.detection.Detector.find`, timed."""
         start = time.perf_counter()
         if not self.checked:
             self.detector.check(x0)
             self.checked = True
         self.detector.borne = self.method.borne()
-        self.contacts = self.detector.find(x0, x1, t0, t1, dt, ahead)
+        self.contacts = self.detector.find(x0, x1, t0, t1, **options)
         self.seconds += time.perf_counter() - start
         return self.contacts
 
@@ -166,27 +171,43 @@ def equilibrium(
     results: list[Result] = []
     left, state, start = budget, placed, x
     before: np.ndarray | None = x
-    ahead, far = toucher.size, toucher.reach  # at first anything may come to touch
-    for _ in range(ROUNDS):
-        contacts = toucher.find(start, state, t0, t, ahead=ahead)
-        state = contacts.put_outside(state)
-        result = run(method, state, left, monitor, before, targets, contacts, bool(results), partial(_far, state, far))
+    ahead, far, moved = toucher.size, toucher.reach, [0.0]  # at first anything may come to touch
+    for number in range(ROUNDS):
+        contacts = toucher.find(start, state, t0, t, ahead=ahead, hold=max(HOLD * EASE**number, LEAST_HOLD))
+        state = begun = contacts.put_outside(state)
+
+        def leave(x: np.ndarray, begun: np.ndarray = begun) -> bool:
+            return _most(begun, x) > far
+
+        result = run(method, state, left, monitor, before, targets, contacts, bool(results), leave)
         results.append(result)
         left = _left(budget, results)
         settled = result.iterations == 0 and result.status is not Status.ITERATIONS
         now = np.asarray(result.x, float)
         if budget.error is not None and result.status is Status.CONVERGED:
-            settled |= not _far(state, budget.error / SAFETY, now)
+            settled |= _most(state, now) <= budget.error / SAFETY
         if not result.status.ok or settled or result.status is Status.SECONDS or left.cap == 0:
             break
+        if _stagnates([r.residuals[0] for r in results]):
+            results[-1] = replace(result, status=Status.CONTACTS)
+            break
+        moved.append(_most(state, now))
         state = start = now
         t0, before, ahead = t, None, far
-    return joined(results, budget)
+    else:
+        results[-1] = replace(results[-1], status=Status.CONTACTS)
+    return joined(results, moved)
 
 
-def _far(x: np.ndarray, far: float, now: np.ndarray) -> bool:
-    """Whether a vertex has moved farther than ``far`` [m] from x (n_vert, 3)."""
-    return float(((now - x) ** 2).sum(1).max(initial=0.0)) > far * far
+def _stagnates(first: list[float]) -> bool:
+    """Whether the residuals that rounds began with no longer fall: contacts come and go."""
+    recent, before = first[-LATELY:], first[1:-LATELY]
+    return len(before) >= LATELY and min(recent) > 0.7 * min(before)
+
+
+def _most(x: np.ndarray, now: np.ndarray) -> float:
+    """How far the vertex has moved that moved most, from x (n_vert, 3) [m]."""
+    return math.sqrt(((now - x) ** 2).sum(1).max(initial=0.0))
 
 
 def _left(budget: Budget, results: list[Result]) -> Budget:
@@ -202,19 +223,19 @@ def _left(budget: Budget, results: list[Result]) -> Budget:
     )
 
 
-def joined(results: list[Result], budget: Budget) -> Result:
-    """The results of successive rounds as one."""
+def joined(results: list[Result], moved: list[float]) -> Result:
+    """The results of successive rounds as one, of which each but the last has ``moved`` vertices by so much [m].
+
+    To the error comes what further rounds may move, if they go on as the last did.
+    """
     last = results[-1]
     if len(results) == 1:
         return last
     done = np.cumsum([0] + [r.iterations for r in results])
-    status = last.status
-    if status is Status.ITERATIONS and done[-1] < budget.cap:
-        status = Status.CONTACTS
+    rate = min(moved[-1] / moved[-2], SLOWEST) if moved[-2] > 0 else 0.0
     return replace(
         last,
-        status=status,
-        error=last.error if last.iterations else results[-2].error,
+        error=moved[-1] * rate / (1 - rate) + (last.error if last.iterations else results[-2].error),
         iterations=int(done[-1]),
         residuals=np.concatenate([r.residuals for r in results]),
         energies=np.concatenate([r.energies for r in results]),

@@ -119,16 +119,15 @@ class CoarseSpace:
         self.wait, self.patience = 0, 1  # refreshes before cloth's exact Hessian is tried again
         self.definite = True  # whether it was found positive definite, or there is no cloth
 
-    def touch(self, touching: ContactEnergy | None, x: np.ndarray, slack: float) -> None:
-        """Take what resists at positions x (n, 3) of contacts and of half-spaces touched to within ``slack`` [m]."""
+    def touch(self, touching: ContactEnergy | None, x: np.ndarray, active: np.ndarray | None) -> None:
+        """Take what touches at positions x (n, 3): the contacts and half-spaces that are ``active``."""
         key, total = b"", self.tied
-        if touching is not None:
-            active = touching.active(x, slack)
+        if touching is not None and active is not None:
             key = touching.name + active.tobytes()
         if key == self.touched:
             return
         self.touched = key
-        if touching is not None and active.any():
+        if touching is not None and active is not None and active.any():
             found = touching.hessian(x, active, self.bearing, self.up)
             total = found if total is None else (total + found).tobsr((3, 3))
         self.solver.add(total)

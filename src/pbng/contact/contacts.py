@@ -73,7 +73,6 @@ class Contacts:
         x = np.array(x, float)
         return _moved_in(x, self.vertex, self.plane, self.level)
 
-
     def parted(self, x: np.ndarray, fixed: np.ndarray) -> np.ndarray | None:
         """A copy of x (n_vert, 3) in its half-spaces and with less overlap: a state to begin at. None if none resists.
 
@@ -203,6 +202,18 @@ class ContactEnergy:
         at = scipy.sparse.csr_matrix((np.ones(len(v)), (np.arange(len(v)), v)), (len(v), k))
         W = scipy.sparse.vstack([self.weights[used][:, :k], at]).tocsr() @ U
         return stencil_hessian(W, np.concatenate([K[used], walls]))
+
+    def closing(self, x: np.ndarray, active: np.ndarray, bearing: np.ndarray) -> np.ndarray:
+        """Forces (n, 3) [N] that draw shut those contacts and half-spaces that are ``active`` and open at x.
+
+        With them the springs of :meth:`hessian` are at rest where the gap is zero, not where it is now.
+        """
+        m = len(self.k_n)
+        gap = np.maximum((self.normal * (self.weights @ x)).sum(1) - self.offset, 0.0)
+        f = -(self.spread @ ((active[:m] * self.k_n * gap)[:, None] * self.normal))
+        height = np.maximum((self.plane * x[self.vertex]).sum(1) - self.level, 0.0)
+        np.add.at(f, self.vertex, -(active[m:] * bearing[self.vertex] * height)[:, None] * self.plane)
+        return f
 
     def _gaps(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """C (m, 3), and min(gap, 0) (m,)."""

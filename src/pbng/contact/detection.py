@@ -29,7 +29,6 @@ STIFF = 10.0  # default stiffness, in E h of the softer body
 PUSH = 5.0  # how many edges a second a stiff contact may push apart what overlaps [1/s]
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
 CREEP = 1e-3  # of the margin: ways shorter than this do not count as sliding
-STEADY = 0.1  # of k_n: tangential stiffness where rounds go on until nothing moves, so that it bears nothing in the end
 SHARP = 0.9  # cosine of the angle between the normals at an edge, below which it counts as sharp
 TOUCHING = 1e-9  # of the radius: closer points have no direction between them
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
@@ -99,13 +98,13 @@ class SurfaceDetector:
         used = (cosine < SHARP) | ~self.solid[self.body[edges[:, 0]]]
         return edges[used], beside[used]
 
-    def find(self, x0: np.ndarray, x1: np.ndarray, dt: float | None, ahead: float) -> Contacts:
+    def find(self, x0: np.ndarray, x1: np.ndarray, dt: float | None, ahead: float, hold: float) -> Contacts:
         """Contacts of a step from x0 to, it is expected, x1 (n_vert, 3), give or take ``ahead`` [m].
 
         With inertia, in a step of dt [s], contacts do not part at once what overlaps, or it would fly apart: their
         offset is one at which they push with the stress E, or as far as they may in a step. Without inertia, dt = None,
-        those that resist hold on where they are until they are found anew: nothing else keeps what may slide freely
-        from sliding past what it was found with.
+        those that resist hold on where they are until they are found anew, by ``hold`` of k_n: nothing else keeps what
+        may slide freely from sliding past what it was found with.
         """
         s = self.surfaces
         x0 = np.ascontiguousarray(x0, float)
@@ -130,7 +129,7 @@ class SurfaceDetector:
             seen[pairs[-1].vertices] = True
             edge_reach[~seen[self.edges].any(1)] = -1.0
             pairs.append(self._edge_edge(x0, edge_reach, self.meets_itself, self.near_edges))
-        return self._contacts(pairs, dt)
+        return self._contacts(pairs, dt, hold)
 
     def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Any) -> _Pairs:
         s, vertex = self.surfaces, self.vertex
@@ -233,7 +232,7 @@ class SurfaceDetector:
         a, b = self.beside[edge].T
         return _area_vectors(x, self.surfaces.triangles[a]) + _area_vectors(x, self.surfaces.triangles[b])
 
-    def _contacts(self, pairs: list[_Pairs], dt: float | None) -> Contacts:
+    def _contacts(self, pairs: list[_Pairs], dt: float | None, hold: float) -> Contacts:
         s = self.surfaces
         p = _Pairs(*(np.concatenate([getattr(q, f.name) for q in pairs]) for f in fields(_Pairs)))
         p = p.some(~self.fixed[p.vertices].all(1))
@@ -249,7 +248,7 @@ class SurfaceDetector:
         softer = s.stiffness[p.bodies].min(1)
         k_n = np.full(len(gap), s.k_n) if s.k_n is not None else STIFF * softer
         if dt is None:
-            offset, k_tau = kept, np.maximum(s.k_tau, STEADY * k_n)
+            offset, k_tau = kept, np.maximum(s.k_tau, hold * k_n)
         else:
             push = np.maximum(PUSH * dt, softer / k_n) * spacing
             offset, k_tau = np.minimum(kept, gap + push), np.full(len(gap), s.k_tau)
@@ -345,17 +344,25 @@ class Detector:
             self.surfaces.check(x)
 
     def find(
-        self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, dt: float | None = None, ahead: float = 0.0
+        self,
+        x0: np.ndarray,
+        x1: np.ndarray,
+        t0: float,
+        t1: float,
+        dt: float | None = None,
+        ahead: float = 0.0,
+        hold: float = 0.0,
     ) -> Contacts:
         """Contacts of a step from x0 at time t0 to, it is expected, x1 at t1 (n_vert, 3); see the module.
 
-        ``dt`` is for motion (:meth:`SurfaceDetector.find`); ``ahead`` [m] is how far from x1 vertices may come to
-        lie. With t0 = t1 the step goes on in which contacts were sought last: friction counts from where that began.
+        ``dt`` is for motion, and ``hold`` for rest (:meth:`SurfaceDetector.find`); ``ahead`` [m] is how far from x1
+        vertices may come to lie. With t0 = t1 the step goes on in which contacts were sought last: friction counts from
+        where that began.
         """
         if t0 < t1 or self.since is None:
             self.since = x0, t0
         clock = time.perf_counter()
-        found = self.surfaces.find(x0, x1, dt, ahead) if self.surfaces else Contacts()
+        found = self.surfaces.find(x0, x1, dt, ahead, hold) if self.surfaces else Contacts()
         now = time.perf_counter()
         self.seconds.surfaces += now - clock
         before, after, near = x0[self.free], x1[self.free], np.asarray(self.spec.margin + ahead)

@@ -33,6 +33,7 @@ from pbng.solvers.threads import check_threads
 DECREASE = 1e-4  # of f·Uy: what a correction must lower the energy by
 BACKTRACKS, BACKTRACKS_CLOTH = 6, 10  # cloth that lies flat does not resist at first, and then all the more
 SHRINK = 0.5
+CLOSINGS = 3  # how often a correction is sought anew for the contacts that it would run into
 SLOWEST = 0.9  # rate of convergence that an estimate of the error supposes at most
 TOO_LITTLE = 10  # how much larger than a Newton step it supposes the error to be, at most
 NEAR_SADDLES = 0.98, 50  # the same two where the Hessian of cloth is found indefinite, as while it buckles
@@ -150,18 +151,31 @@ class TwoGrid(PackedMethod):
         if not np.isfinite(f).all():
             self._tread_softly()
             return
-        self.coarse.touch(self.touching, self._places(g), self.slack(g))
-        self.coarse.refresh(g)
-        self.refreshed = True
-        slope = self.coarse.direction(f, self.d, COARSE_TOLERANCE)
         tolerance = self.noise(self.x, self.E)
-        np.add(g[:n], self.d, out=z[:n], casting="same_kind")
-        self.admit(z, g)
-        self.Ez = self.energy(z)
-        if self.Ez <= self.E - DECREASE * slope + tolerance:
-            if self.softness.succeed() and self.history is not None:
-                self.history.restart()  # it was that of another map
-            return
+        touching, at = self.touching, self._places(g)
+        active = touching.active(at, self.slack(g)) if touching else None
+        self.refreshed, pull = True, f
+        for closing in range(CLOSINGS + 1):
+            self.coarse.touch(touching, at, active)
+            self.coarse.refresh(g)
+            slope = self.coarse.direction(pull, self.d, COARSE_TOLERANCE)
+            slope = slope if not closing else max(float((f * self.d).sum()), 0.0)
+            np.add(g[:n], self.d, out=z[:n], casting="same_kind")
+            self.admit(z, g)
+            self.Ez = self.energy(z)
+            if self.Ez <= self.E - DECREASE * slope + tolerance:
+                if self.softness.succeed() and self.history is not None:
+                    self.history.restart()  # it was that of another map
+                return
+            if touching is None:
+                break
+            closed = active | touching.active(self._places(z), self.slack(z))
+            if (closed == active).all():
+                break
+            # What the correction runs into is to be closed by it, and to resist.
+            active = closed
+            pull = f.copy()
+            self._places(pull)[:] += touching.closing(at, active, self.coarse.bearing)[: n // 4]
         Eg, alpha = self.energy(g), 1.0
         if self.rises(Eg, self.E, self.x):
             self._tread_softly()
