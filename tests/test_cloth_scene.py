@@ -195,7 +195,7 @@ def test_projected_stiffness(projection):
 
 
 def test_cloth_beside_a_solid():
-    """A sheet tied to a block hangs and buckles: cycles end no higher than Newton's method, and where forces balance."""
+    """A sheet tied to a block hangs and buckles: cycles end where forces balance, no higher than Newton's method."""
     scene = pbng.Scene(gravity=(0, -9.8, 0))
     block = scene.add(pbng.shapes.box((1.0, 0.3, 0.3), (9, 3, 3)), FLESH)
     flag = scene.add(pbng.shapes.rectangle((0.5, 0.5), 5), CLOTH, BENDINGS[1], at=(0.5, -0.5, 0.0))
