@@ -243,6 +243,11 @@ def test_a_plane_body_has_no_surface():
         scene.contact()
 
 
+def test_only_colliders_collide():
+    with pytest.raises(pbng.InputError, match="expected a collider such as Plane"):
+        pbng.Scene().collide_with([pbng.Plane((0, 0, 0), (0, 1, 0)), 3])
+
+
 def test_other_methods_say_that_they_know_no_contact():
     scene, _ = two_blocks(3)
     problem = scene.compile(free=True)

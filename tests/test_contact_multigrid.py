@@ -1,5 +1,6 @@
 """The two-grid cycle where things touch: its counts stay, and its estimate of the error is true."""
 
+import numba
 import numpy as np
 import pytest
 
@@ -63,3 +64,15 @@ def test_the_error_estimate_is_true_in_contact(scene):
     error = np.linalg.norm(rough.x - fine.x, axis=1).max()
     assert error <= 3 * rough.error
     assert rough.error < 0.1
+
+
+def test_the_same_bits_for_any_number_of_threads():
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("one thread only")
+    found = []
+    for threads in (1, 2):
+        budget = pbng.Budget(rtol=1e-3)
+        *_, last = pbng.simulate(stacked(6), pbng.MultigridPBNG(threads=threads), budget, frames=5)
+        assert last.contact.pairs > 0
+        found.append((last.x.tobytes(), last.result.iterations, last.result.residual))
+    assert found[0] == found[1]

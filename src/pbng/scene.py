@@ -193,9 +193,12 @@ class Scene:
 
         Args:
             colliders: :class:`pbng.Plane`, :class:`pbng.Sphere`, :class:`pbng.Capsule`, :class:`pbng.Box`,
-                :class:`pbng.Kinematic`, or several.
+                :class:`pbng.Kinematic`, or a list of them.
+
+        Raises:
+            InputError: One is not a collider.
         """
-        several = [colliders] if isinstance(colliders, Collider) else list(colliders)
+        several: list[Any] = list(colliders) if isinstance(colliders, list | tuple) else [colliders]
         for c in several:
             if not isinstance(c, Collider):
                 raise InputError(f"collide_with: expected a collider such as Plane or Kinematic, not {c!r:.80}")
