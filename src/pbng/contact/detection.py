@@ -30,6 +30,7 @@ PUSH = 5.0  # how many edges a second a stiff contact may push apart what overla
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
 CREEP = 1e-3  # of the margin: ways shorter than this do not count as sliding
 SHARP = 0.9  # cosine of the angle between the normals at an edge, below which it counts as sharp
+SLIPPED = 4.0  # how much closer a triangle must be by which a vertex does not face what it is inside of
 TOUCHING = 1e-9  # of the radius: closer points have no direction between them
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
 
@@ -140,13 +141,7 @@ class SurfaceDetector:
         triangle[through] = -1
         deep = np.flatnonzero(inside >= 0)
         if len(deep):
-            # What is inside a solid leaves it by the closest of its triangles that it is behind and that it faces.
-            only = inside[deep, None] == np.arange(len(s.names))
-            v = vertex[deep]
-            triangle[deep], weights[deep], _ = closest_triangles(
-                self.triangles, x, x[v], own=np.arange(len(deep)), meets=only, vertex=v, excluded=excluded, behind=True,
-                against=self._vertex_normals(x, v),
-            )  # fmt: skip
+            triangle[deep], weights[deep] = self._way_out(x, vertex[deep], inside[deep], excluded)
         found = np.flatnonzero(triangle >= 0)
         v, corners = vertex[found], s.triangles[triangle[found]]
         return _Pairs(
@@ -158,6 +153,23 @@ class SurfaceDetector:
             inside=inside[found] >= 0,
             bodies=np.column_stack([own[found], s.body[triangle[found]]]),
         )
+
+    def _way_out(
+        self, x: np.ndarray, vertex: np.ndarray, solid: np.ndarray, excluded: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """By which triangle a vertex leaves the solid that it is inside of, (k,), and weights of its closest point.
+
+        By the closest that it is behind and that it faces, as it came in where surfaces met; but where another that it
+        is behind is much closer, it slipped in by that.
+        """
+        only = solid[:, None] == np.arange(len(self.surfaces.names))
+        asked: dict[str, Any] = {"own": np.arange(len(vertex)), "meets": only, "vertex": vertex, "excluded": excluded}
+        near, w, d = closest_triangles(self.triangles, x, x[vertex], **asked, behind=True)
+        facing, w_facing, d_facing = closest_triangles(
+            self.triangles, x, x[vertex], **asked, behind=True, against=self._vertex_normals(x, vertex)
+        )
+        chosen = (facing >= 0) & (d_facing <= SLIPPED * d + CLOSE * self.surfaces.spacing[solid])
+        return np.where(chosen, facing, near), np.where(chosen[:, None], w_facing, w)
 
     def _inside(
         self, x: np.ndarray, triangle: np.ndarray, weights: np.ndarray, meets: np.ndarray, excluded: Any
@@ -217,7 +229,9 @@ class SurfaceDetector:
         inside = solid & (ahead < 0) & (back > 0)
         outward = np.where(((across * theirs_out).sum(1) < 0)[:, None], -across, across)
         pairs = _Pairs(stencil, weights, first, second, outward, inside, bodies)
-        return pairs if excluded is None else pairs.some(~solid | ((ahead > 0) & (back < 0)))
+        # Deep in each other, two edges tell nothing of the way out; vertices do.
+        clear = ~inside | (np.linalg.norm(first - second, axis=1) < CLOSE * self.surfaces.spacing[bodies].min(1))
+        return pairs.some(clear if excluded is None else ~solid | ((ahead > 0) & (back < 0)))
 
     def _vertex_normals(self, x: np.ndarray, vertex: np.ndarray) -> np.ndarray:
         """Sum of the area vectors of the triangles around vertices, (k, 3)."""
