@@ -8,7 +8,6 @@ long as in one step it does not pass by the pair that it was found with.
 """
 
 import math
-import time
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -311,14 +310,6 @@ def _beside(triangles: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return order[np.column_stack([first, last - 1])] // 3
 
 
-@dataclass
-class Seconds:
-    """Where the time of contact goes [s]."""
-
-    surfaces: float = 0.0
-    colliders: float = 0.0
-
-
 class Detector:
     """Finds everything that may touch in a step.
 
@@ -332,7 +323,6 @@ class Detector:
         self.spec = spec
         self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
         self.free = spec.surface[~fixed[spec.surface]]
-        self.seconds = Seconds()
         self.reach = self.surfaces.radius if self.surfaces else math.inf  # farther off, directions are of no use [m]
         self.since: tuple[np.ndarray, float] | None = None  # where the last step began, and when [s]
         self.borne = np.zeros((len(X), 3))  # with what force [N] colliders bear each vertex
@@ -375,10 +365,7 @@ class Detector:
         """
         if t0 < t1 or self.since is None:
             self.since = x0, t0
-        clock = time.perf_counter()
         found = self.surfaces.find(x0, x1, dt, ahead, hold) if self.surfaces else Contacts()
-        now = time.perf_counter()
-        self.seconds.surfaces += now - clock
         before, after, near = x0[self.free], x1[self.free], np.asarray(self.spec.margin + ahead)
         if dt is not None:
             near = CLOSE / NEAR * self.spec.margin + np.linalg.norm(after - before, axis=1)
@@ -395,5 +382,4 @@ class Detector:
                 anchor=self._anchors(touches, vertex, t1),
                 creep=CREEP * self.spec.margin,
             )
-        self.seconds.colliders += time.perf_counter() - now
         return found

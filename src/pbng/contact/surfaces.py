@@ -36,11 +36,9 @@ def contact_spec(bodies: Sequence[Body], rule: ContactRule | None, colliders: Se
     """
     if not bodies or (rule is None and not colliders):
         return None
-    names = [b.name for b in bodies]
     surfaces = None if rule is None else _surfaces(bodies, rule)
     vertices = [b.start + np.unique(b.faces) for b in bodies] if colliders else [surfaces.vertices]  # type: ignore[union-attr]
     spacing = [_spacing(b) for b in bodies]
-    assert len(names) == len(spacing)
     return ContactSpec(np.unique(np.concatenate(vertices)), surfaces, tuple(colliders), NEAR * float(np.mean(spacing)))
 
 
