@@ -153,6 +153,10 @@ class FrameWriter:
         if append:
             self.n_written = len(_in_order(path, frames))
 
+    def count(self) -> int:
+        """Frames on the disk: one more than ``n_written`` if Ctrl-C came when the last had just been put there."""
+        return max(self.n_written, len(_frame_files(self.path))) if self.n_written else 0
+
     def write(self, frame: Any) -> None:
         """Add a frame: an object with ``index, t, x, result, problem`` as :func:`pbng.simulate` yields them.
 
