@@ -11,7 +11,7 @@ import numpy as np
 from pbng.assembly import group_parameters
 from pbng.compounds import CompoundIncidences, Compounds
 from pbng.constraints import WeakConstraints
-from pbng.elements import compound, weak
+from pbng.elements import weak
 from pbng.elements.base import W
 from pbng.problem import Problem
 
@@ -69,7 +69,7 @@ class Groups:
             for g, p, block in zip(elements, first, blocks):
                 kind, model = g.term
                 if compounds:
-                    self._add(compound.sweep(kind, model), p, kind.corners, compound.width(kind), block)
+                    self._add(kind.compound_sweep(model), p, kind.corners, kind.compound_width, block)
                 else:
                     sweep = kind.paper_sweep(model) if paper_block else kind.sweep(model)
                     self._add(sweep, p, kind.others, kind.width(model.isotropic), block)
@@ -123,7 +123,7 @@ def _of_compounds(i: CompoundIncidences) -> tuple[np.ndarray, np.ndarray, np.nda
     """Cells, opposite, data and packer of a family of compounds."""
     w: Any = i.source
     if not isinstance(w, WeakConstraints):
-        return i.cells, compound.corners(w), i.beta, compound.pack(w)
+        return i.cells, np.array([w.order], np.int64), i.beta, w.compound_pack()
     seen = weak.weak_data(w.weights[i.cell], w.K[i.cell], w.anchored)
     own = (w.weights[i.cell] * i.beta).sum(1)  # how much C changes when the compound moves
     cells = np.column_stack([i.cells[:, :1], i.cells])  # the first place stands for the compound, which is nowhere

@@ -13,6 +13,7 @@ import numpy as np
 from numba import uint64
 
 from pbng.jit import inline, leaf
+from pbng.linalg import scale
 from pbng.materials.base import Model
 
 W = 16  # lanes: float32 fills one AVX-512 register; float64 is as fast with 16 as with 8
@@ -29,7 +30,7 @@ class ElementKind(ABC):
     opposite: ClassVar[np.ndarray]  # (corners, others): for each corner, the local numbers of the others, in order
     across: ClassVar[float] = 0.0  # part of F₃₃ that does not come from the vertices
     solid: ClassVar[bool] = True  # whether elements fill space, or the plane, and can be inverted; cloth does not
-    compound_width: ClassVar[int] = 0  # coefficients stored for one incidence of a compound node
+    compound_width: ClassVar[int]  # coefficients stored for one incidence of a compound node
 
     @property
     def order(self) -> list[int]:
@@ -75,13 +76,16 @@ class ElementKind(ABC):
         """The same, with the forces on the elements' corners added to f; returns the sum of the norms of the
         elements' forces [N] and the number of inverted elements."""
 
+    @abstractmethod
     def compound_pack(self) -> Any:
-        """As :meth:`pack`, for compound nodes; of simplices see :mod:`pbng.elements.compound`."""
-        raise NotImplementedError
+        """As :meth:`pack`, for compound nodes; ``data`` holds how much each corner moves with the compound.
 
+        Such an incidence refers to all corners, as several may move, in their :attr:`order`.
+        """
+
+    @abstractmethod
     def compound_sweep(self, model: Model) -> Any:
         """As :meth:`sweep`, for compound nodes."""
-        raise NotImplementedError
 
 
 class Term(NamedTuple):
@@ -128,3 +132,36 @@ def parameters(n: int) -> Any:
         return inline(lambda par, p: ())
     before, last = parameters(n - 1), uint64(n - 1)
     return inline(lambda par, p: (*before(par, p), par[p + last]))
+
+
+@inline
+def add_outer(acc, l, h, v):
+    """Add h v vᵀ to the Hessians (rows 3 to 8 of acc) of lane l."""
+    u = scale(h, v)
+    acc[uint64(3 * W) + l] += u[0] * v[0]
+    acc[uint64(4 * W) + l] += u[0] * v[1]
+    acc[uint64(5 * W) + l] += u[0] * v[2]
+    acc[uint64(6 * W) + l] += u[1] * v[1]
+    acc[uint64(7 * W) + l] += u[1] * v[2]
+    acc[uint64(8 * W) + l] += u[2] * v[2]
+
+
+@inline
+def summed(out, m):
+    """The sum of the first m numbers."""
+    total = 0.0
+    for l_ in range(m):
+        total += out[uint64(l_)]
+    return total
+
+
+@inline
+def spread(corners, m, i, idx, out, f):
+    """Add the forces on the corners of the first m elements, vector by vector in out, to f at ``idx[i]``."""
+    for l_ in range(m):
+        l = uint64(l_)
+        for a in range(corners):
+            at, j = uint64(idx[i + uint64(W * a) + l]), uint64(3 * W * a) + l
+            f[at] += out[j]
+            f[at + uint64(1)] += out[j + uint64(W)]
+            f[at + uint64(2)] += out[j + uint64(2 * W)]

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from numba import uint64
 
-from pbng.elements.base import AHEAD, ElementKind, W, gather, parameters, vec, wide_vec
-from pbng.elements.membrane import add_outer
+from pbng.elements.base import AHEAD, ElementKind, W, add_outer, gather, parameters, spread, summed, vec, wide_vec
 from pbng.elements.simplex import corner
 from pbng.jit import inline
 from pbng.linalg import arctan2, combine, cross, dot, scale, sub
@@ -201,10 +200,7 @@ class Hinge(ElementKind):
                 angle0, weight, least = at_rest(vec(gX, j), vec(gX, j + _Q), vec(gX, j + _R), vec(gX, j + _S))
                 x0, x1, x2, x3 = wide_vec(gx, j), wide_vec(gx, j + _Q), wide_vec(gx, j + _R), wide_vec(gx, j + _S)
                 out[l] = weight * psi(turned(fold(x0, x1, x2, x3, least)[0], angle0), *number)
-            total = 0.0
-            for l_ in range(m):
-                total += out[uint64(l_)]
-            return total, 0
+            return summed(out, m), 0
 
         return energy
 
@@ -232,16 +228,8 @@ class Hinge(ElementKind):
                 out[_6 + l], out[uint64(7 * W) + l], out[_8 + l] = f2
                 out[_9 + l], out[_10 + l], out[_11 + l] = f3
                 out[_12 + l] = math.sqrt(dot(f0, f0) + dot(f1, f1) + dot(f2, f2) + dot(f3, f3))
-            size = 0.0
-            for l_ in range(m):
-                l = uint64(l_)
-                for a in range(4):
-                    at, j = uint64(idx[i + uint64(W * a) + l]), uint64(3 * W * a) + l
-                    f[at] += out[j]
-                    f[at + uint64(1)] += out[j + _1]
-                    f[at + uint64(2)] += out[j + _2]
-                size += out[_12 + l]
-            return size, 0
+            spread(4, m, i, idx, out, f)
+            return summed(out[_12:], m), 0
 
         return forces
 
@@ -252,7 +240,6 @@ class Hinge(ElementKind):
 
     @cache
     def compound_pack(self) -> Any:
-        """As :func:`pbng.elements.compound.pack`."""
         at_rest = self._rest()
 
         @inline
@@ -269,7 +256,6 @@ class Hinge(ElementKind):
 
     @cache
     def compound_sweep(self, model: Model) -> Any:
-        """As :func:`pbng.elements.compound.sweep`."""
         moment, numbers = model.stress, parameters(model.n_parameters)
 
         @inline

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numba import uint64
 
-from pbng.elements.base import AHEAD, ElementKind, W, gather, parameters, vec, wide_vec
+from pbng.elements.base import AHEAD, ElementKind, W, add_outer, gather, parameters, spread, summed, vec, wide_vec
 from pbng.elements.simplex import corner
 from pbng.errors import InputError
 from pbng.jit import inline
@@ -50,18 +50,6 @@ def add_perpendicular(acc, l, h, v):
     acc[_6 + l] += h * (xx + zz)
     acc[_7 + l] -= h * v[1] * v[2]
     acc[_8 + l] += h * (xx + yy)
-
-
-@inline
-def add_outer(acc, l, h, v):
-    """Add h v vᵀ to the Hessians of lane l."""
-    u = scale(h, v)
-    acc[_3 + l] += u[0] * v[0]
-    acc[_4 + l] += u[0] * v[1]
-    acc[_5 + l] += u[0] * v[2]
-    acc[_6 + l] += u[1] * v[1]
-    acc[_7 + l] += u[1] * v[2]
-    acc[_8 + l] += u[2] * v[2]
 
 
 @inline
@@ -171,10 +159,7 @@ class SurfaceTriangle(ElementKind):
                 l = uint64(l_)
                 F, (_k0, _k1, _k2, area) = element(gx, gX, l * uint64(4))
                 out[l] = area * psi(F, *number)
-            total = 0.0
-            for l_ in range(m):
-                total += out[uint64(l_)]
-            return total, 0
+            return summed(out, m), 0
 
         return energy
 
@@ -197,16 +182,8 @@ class SurfaceTriangle(ElementKind):
                 out[_3 + l], out[_4 + l], out[_5 + l] = fa
                 out[_6 + l], out[_7 + l], out[_8 + l] = fe
                 out[_9 + l] = math.sqrt(dot(fp, fp) + dot(fa, fa) + dot(fe, fe))
-            size = 0.0
-            for l_ in range(m):
-                l = uint64(l_)
-                for a in range(3):
-                    at, j = uint64(idx[i + uint64(W * a) + l]), uint64(3 * W * a) + l
-                    f[at] += out[j]
-                    f[at + uint64(1)] += out[j + _1]
-                    f[at + uint64(2)] += out[j + _2]
-                size += out[_9 + l]
-            return size, 0
+            spread(3, m, i, idx, out, f)
+            return summed(out[_9:], m), 0
 
         return forces
 
@@ -216,8 +193,6 @@ class SurfaceTriangle(ElementKind):
 
     @cache
     def compound_pack(self) -> Any:
-        """As :func:`pbng.elements.compound.pack`."""
-
         @inline
         def pack(X, cells, e, a, opposite, once, coef, at, block, data, nodal, to):
             ip, ia, ie = opposite[0, 0], opposite[0, 1], opposite[0, 2]
@@ -236,7 +211,6 @@ class SurfaceTriangle(ElementKind):
 
     @cache
     def compound_sweep(self, model: Model) -> Any:
-        """As :func:`pbng.elements.compound.sweep`."""
         stress, numbers = model.stress, parameters(model.n_parameters)
 
         @inline

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numba import uint64
 
-from pbng.elements.base import AHEAD, ElementKind, W, gather, parameters, vec, wide_vec
+from pbng.elements.base import AHEAD, ElementKind, W, add_outer, gather, parameters, spread, summed, vec, wide_vec
 from pbng.jit import inline
 from pbng.linalg import add, cofactor, combine, combine3, cross, det, dot, mat_vec, scale, sub
 from pbng.materials.base import Model
 
-NODE_FRAME, REST_FRAME = 7, 10  # coefficients of an incidence
+NODE_FRAME, REST_FRAME, COMPOUND = 7, 10, 13  # coefficients of an incidence, of that of a compound node
 zero = uint64(0)
 _1, _2, _3, _4, _5, _6 = (uint64(W * j) for j in range(1, 7))
 _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(7, 12))
@@ -176,13 +176,7 @@ class Simplex(ElementKind):
                         acc[l] -= f[0]
                         acc[_1 + l] -= f[1]
                         acc[_2 + l] -= f[2]
-                        u = scale(h, v)
-                        acc[_3 + l] += u[0] * v[0]
-                        acc[_4 + l] += u[0] * v[1]
-                        acc[_5 + l] += u[0] * v[2]
-                        acc[_6 + l] += u[1] * v[1]
-                        acc[_7 + l] += u[1] * v[2]
-                        acc[_8 + l] += u[2] * v[2]
+                        add_outer(acc, l, h, v)
                     c += coef_row
 
         return sweep
@@ -243,10 +237,7 @@ class Simplex(ElementKind):
                 l = uint64(l_)
                 F, _ga, _gb, _ge, V = element(gx, gX, l * uint64(4))
                 out[l] = V * psi(F, *number)
-            total = 0.0
-            for l_ in range(m):
-                total += out[uint64(l_)]
-            return total, 0
+            return summed(out, m), 0
 
         return energy
 
@@ -278,19 +269,80 @@ class Simplex(ElementKind):
                 out[last + l], out[last + _1 + l], out[last + _2 + l] = fe
                 out[_12 + l] = math.sqrt(norm2)
                 out[_13 + l] = det(F)
-            size, inverted = 0.0, 0
+            spread(corners, m, i, idx, out, f)
+            inverted = 0
             for l_ in range(m):
-                l = uint64(l_)
-                for a in range(corners):
-                    at, j = uint64(idx[i + uint64(W * a) + l]), uint64(3 * W * a) + l
-                    f[at] += out[j]
-                    f[at + uint64(1)] += out[j + _1]
-                    f[at + uint64(2)] += out[j + _2]
-                size += out[_12 + l]
-                inverted += out[_13 + l] < 0.0
-            return size, inverted
+                inverted += out[_13 + uint64(l_)] < 0.0
+            return summed(out[_12:], m), inverted
 
         return forces
+
+    # How a compound node sees it: F changes by d ⊗ g with g = Σ β_v ∂N_v/∂X. Coefficients are the shape gradients, g
+    # and the volume.
+
+    compound_width = COMPOUND
+
+    @cache
+    def compound_pack(self) -> Any:
+        plane, share = self.plane, self.share
+
+        @inline
+        def pack(X, cells, e, a, opposite, once, coef, at, block, data, nodal, to):
+            last = opposite.shape[1] - 1
+            p = corner(X, cells[e, opposite[0, 0]])
+            ea = sub(corner(X, cells[e, opposite[0, 1]]), p)
+            eb = (0.0, 0.0, 1.0) if plane else sub(corner(X, cells[e, opposite[0, 2]]), p)
+            ee = sub(corner(X, cells[e, opposite[0, last]]), p)
+            ga, gb, ge, V = gradients(ea, eb, ee, once * share)
+            bp, ba, be = data[e, opposite[0, 0]], data[e, opposite[0, 1]], data[e, opposite[0, last]]
+            bb = 0.0 if plane else data[e, opposite[0, 2]]
+            for k in range(3):
+                through = 0.0 if plane else gb[k]  # along z nothing varies in the plane
+                g = ba * ga[k] + bb * through + be * ge[k] - bp * (ga[k] + through + ge[k])
+                coef[at + W * k], coef[at + W * (3 + k)], coef[at + W * (6 + k)] = ga[k], gb[k], ge[k]
+                coef[at + W * (9 + k)] = g
+            coef[at + W * 12] = V
+            g0, g1, g2 = coef[at + W * 9], coef[at + W * 10], coef[at + W * 11]
+            s, t = V * block[0] * (g0 * g0 + g1 * g1 + g2 * g2), V * block[2]
+            nodal[to] += s + t * g0 * g0
+            nodal[to + W] += t * g0 * g1
+            nodal[to + 2 * W] += t * g0 * g2
+            nodal[to + 3 * W] += s + t * g1 * g1
+            nodal[to + 4 * W] += t * g1 * g2
+            nodal[to + 5 * W] += s + t * g2 * g2
+
+        return pack
+
+    @cache
+    def compound_sweep(self, model: Model) -> Any:
+        edges, numbers, stress, n_corner = self.edges(vec), parameters(model.n_parameters), model.stress, self.corners
+        last, row = uint64(4 * W * (n_corner - 1)), uint64(W * n_corner)
+
+        @inline
+        def sweep(n, i, c, x, idx, coef, par, p, g, acc):
+            b = par[p]
+            m = numbers(par, p + uint64(1))
+            for _ in range(n):
+                gather(n_corner, i, x, idx, g, zero)
+                for l_ in range(W):
+                    l = uint64(l_)
+                    j, k = l * uint64(4), c + l
+                    a, d, e = edges(g, j, vec(g, last + j))
+                    ga = coef[k], coef[k + _1], coef[k + _2]
+                    gd = coef[k + _3], coef[k + _4], coef[k + _5]
+                    ge = coef[k + _6], coef[k + _7], coef[k + _8]
+                    shape = coef[k + _9], coef[k + _10], coef[k + _11]
+                    V = coef[k + _12]
+                    F = outer_sum(a, ga, d, gd, e, ge)
+                    f, v = scale(V, mat_vec(stress(F, *m), shape)), mat_vec(cofactor(F), shape)
+                    acc[l] -= f[0]
+                    acc[_1 + l] -= f[1]
+                    acc[_2 + l] -= f[2]
+                    add_outer(acc, l, b * V, v)
+                i += row
+                c += uint64(COMPOUND * W)
+
+        return sweep
 
 
 class Tet(Simplex):
