@@ -25,6 +25,7 @@ class BoxTree:
         nodes: (n, 4) int32: the first of two children, which follow each other, or -1; the range of primitives; the
             group, or -1 where there are several. Parents come before children, level by level.
         boxes: Lowest and highest corner of each node, (n, 6) [m].
+        margin: By how much they are wider about each vertex than it is, (n_vert,) [m].
     """
 
     def __init__(self, x: np.ndarray, cells: np.ndarray, group: np.ndarray | None = None, leaf: int = LEAF) -> None:
@@ -56,14 +57,19 @@ class BoxTree:
         self._start = np.concatenate([[0], levels[max(top, 1) :]])
         self.refit(x)
 
-    def refit(self, x: np.ndarray, y: np.ndarray | None = None, margin: float = 0.0) -> None:
-        """Fit the boxes to positions x (n_vert, 3) [m], or to both x and y, widened by a margin [m] on every side."""
+    def refit(self, x: np.ndarray, y: np.ndarray | None = None, margin: float | np.ndarray = 0.0) -> None:
+        """Fit the boxes to positions x (n_vert, 3) [m], or to both x and y.
+
+        Each vertex counts as a cube of half the edge ``margin`` [m], one for all or (n_vert,): as far as it may go.
+        Queries look for what is so much farther away.
+        """
         x = np.ascontiguousarray(x, np.float64)
         y = x if y is None else np.ascontiguousarray(y, np.float64)
         assert x.shape[1:] == y.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
         assert min(len(x), len(y)) >= self.n_vert, "a vertex has no position"
+        self.margin = np.array(np.broadcast_to(np.asarray(margin, np.float64), len(x)))
         numbers = np.array([self.cells.shape[1], y is not x], np.int64)
-        arrays = (self.nodes, self.boxes, self.sorted_cells.ravel(), x, y, numbers, np.array([margin], np.float64))
+        arrays = (self.nodes, self.boxes, self.sorted_cells.ravel(), x, y, numbers, self.margin)
         run(_refit, arrays, np.arange(len(self._start) - 1)[::-1].copy(), self._start, GRAIN)
 
 
@@ -73,7 +79,7 @@ def _refit(arguments, low, high):
     nodes, boxes = rows(arguments, 0, 4, np.int32), rows(arguments, 1, 6, np.float64)
     cells, x, y = array(arguments, 2, np.int32), rows(arguments, 3, 3, np.float64), rows(arguments, 4, 3, np.float64)
     k, swept = array(arguments, 5, np.int64)[0], array(arguments, 5, np.int64)[1]
-    margin = array(arguments, 6, np.float64)[0]
+    margin = array(arguments, 6, np.float64)
     for i in range(high - 1, low - 1, -1):
         child = nodes[i, 0]
         if child >= 0:
@@ -85,22 +91,24 @@ def _refit(arguments, low, high):
                 boxes[i, j] = a if a > b else b
             continue
         first, last = k * nodes[i, 1], k * nodes[i, 2]
-        a, b = _extended(x, cells, first, last, (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf))
+        a, b = _extended(x, margin, cells, first, last, (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf))
         if swept:
-            a, b = _extended(y, cells, first, last, a, b)
+            a, b = _extended(y, margin, cells, first, last, a, b)
         for j in range(3):
-            boxes[i, j], boxes[i, 3 + j] = a[j] - margin, b[j] + margin
+            boxes[i, j], boxes[i, 3 + j] = a[j], b[j]
 
 
 @inline
-def _extended(x, vertices, first, last, a, b):
-    """Corners a, b of a box extended by the positions of some vertices."""
+def _extended(x, margin, vertices, first, last, a, b):
+    """Corners a, b of a box extended by the cubes about some vertices."""
     ax, ay, az = a
     bx, by, bz = b
     for e in range(first, last):
         v = vertices[e]
-        px, py, pz = x[v, 0], x[v, 1], x[v, 2]
+        m = margin[v]
+        px, py, pz = x[v, 0] - m, x[v, 1] - m, x[v, 2] - m
         ax, ay, az = px if px < ax else ax, py if py < ay else ay, pz if pz < az else az
+        px, py, pz = x[v, 0] + m, x[v, 1] + m, x[v, 2] + m
         bx, by, bz = px if px > bx else bx, py if py > by else by, pz if pz > bz else bz
     return (ax, ay, az), (bx, by, bz)
 

@@ -109,14 +109,13 @@ class SurfaceDetector:
         s = self.surfaces
         x0 = np.ascontiguousarray(x0, float)
         moved = np.linalg.norm(x1 - x0, axis=1)
-        most = float(moved[self.vertex].max(initial=0.0))
         radius = self.radius + min(ahead, AHEAD * self.radius)
         if dt is not None and s.radius is None:
-            radius = CLOSE / NEAR * self.radius + moved + most
-        reach = radius + 2 * float(s.skin.max(initial=0.0)) + moved + most
-        self.triangles.refit(x0)
+            radius, moved = CLOSE / NEAR * self.radius, 2 * moved
+        reach = radius + 2 * float(s.skin.max(initial=0.0)) + moved
+        self.triangles.refit(x0, margin=moved)
         if len(self.edges):
-            self.edge_tree.refit(x0)
+            self.edge_tree.refit(x0, margin=moved)
         edge_reach = reach[self.edges].max(1)
         pairs = []
         if self.several:
@@ -164,10 +163,11 @@ class SurfaceDetector:
         only = solid[:, None] == np.arange(len(self.surfaces.names))
         asked: dict[str, Any] = {"own": np.arange(len(vertex)), "meets": only, "vertex": vertex, "excluded": excluded}
         near, w, d = closest_triangles(self.triangles, x, x[vertex], **asked, behind=True)
+        within = SLIPPED * d + CLOSE * self.surfaces.spacing[solid]
         facing, w_facing, d_facing = closest_triangles(
-            self.triangles, x, x[vertex], **asked, behind=True, against=self._vertex_normals(x, vertex)
+            self.triangles, x, x[vertex], within, **asked, behind=True, against=self._vertex_normals(x, vertex)
         )
-        chosen = (facing >= 0) & (d_facing <= SLIPPED * d + CLOSE * self.surfaces.spacing[solid])
+        chosen = d_facing <= within
         return np.where(chosen, facing, near), np.where(chosen[:, None], w_facing, w)
 
     def _inside(

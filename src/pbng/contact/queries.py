@@ -46,7 +46,8 @@ def closest_triangles(
         tree: Tree over triangles, fitted to x.
         x: Positions (n_vert, 3) [m].
         points: Points (k, 3) [m].
-        reach: How far to look [m], a number or one a point (k,); below 0 a point is not asked.
+        reach: How far to look [m], a number or one a point (k,), to which what is looked at adds the largest margin
+            of its vertices (:meth:`pbng.contact.bvh.BoxTree.refit`); below 0 a point is not asked.
         own, meets, vertex, excluded: What may be found, see above.
         behind: Find only triangles that the point is behind: (point - closest point) · normal < 0.
         against: Directions (k, 3): find only triangles whose normals do not point along them.
@@ -82,7 +83,8 @@ def closest_edges(
         tree: Tree over edges, fitted to x.
         x: Positions (n_vert, 3) [m].
         edges: Vertices (k, 2) of the edges that ask.
-        reach: How far to look [m], a number or one an edge (k,); below 0 an edge is not asked.
+        reach: How far to look [m], a number or one an edge (k,), to which what is looked at adds the larger margin of
+            its vertices; below 0 an edge is not asked.
         own, meets, excluded: What may be found, see above; what either vertex excludes is excluded.
 
     Returns:
@@ -143,7 +145,7 @@ def _common(
     vertex: np.ndarray | None,
     excluded: Excluded | None,
 ) -> tuple[np.ndarray, ...]:
-    """The first 12 arguments of every body; what does not fit is refused here, as bodies read without looking."""
+    """The first 13 arguments of every body; what does not fit is refused here, as bodies read without looking."""
     assert tree.cells.shape[1] == corners, f"a tree over primitives of {corners} vertices is needed"
     x = np.ascontiguousarray(x, np.float64)
     assert x.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
@@ -160,7 +162,8 @@ def _common(
     vertex = _numbers(vertex, k, NONE if excluded is None else len(start) - 1)
     sizes = np.array([grouped, meets.shape[1], excluded is not None], np.int64)
     start, ids = np.ascontiguousarray(start, np.int64), np.ascontiguousarray(ids, np.int32)
-    return tree.nodes, tree.boxes, tree.order, tree.sorted_cells, x, reaches, sizes, meets, own, vertex, start, ids
+    asked = reaches, sizes, meets, own, vertex, start, ids
+    return tree.nodes, tree.boxes, tree.order, tree.sorted_cells, x, *asked, tree.margin
 
 
 def _numbers(a: np.ndarray | None, k: int, end: int) -> np.ndarray:
@@ -186,6 +189,11 @@ def _gap2(boxes, i, low, high):
     dy = max(boxes[i, 1] - high[1], 0.0, low[1] - boxes[i, 4])
     dz = max(boxes[i, 2] - high[2], 0.0, low[2] - boxes[i, 5])
     return dx * dx + dy * dy + dz * dz
+
+
+@inline
+def _squared(a):
+    return a * a
 
 
 @inline
@@ -223,10 +231,11 @@ def _closest_triangles(arguments, low, high):
     reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
     own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
     start, ids = array(arguments, 10, np.int64), array(arguments, 11, np.int32)
-    points, behind = rows(arguments, 12, 3, np.float64), array(arguments, 13, np.int64)[0]
-    directed, against = array(arguments, 13, np.int64)[1], rows(arguments, 17, 3, np.float64)
-    found, weights = array(arguments, 14, np.int32), rows(arguments, 15, 3, np.float64)
-    distance = array(arguments, 16, np.float64)
+    margin = array(arguments, 12, np.float64)
+    points, behind = rows(arguments, 13, 3, np.float64), array(arguments, 14, np.int64)[0]
+    directed, against = array(arguments, 14, np.int64)[1], rows(arguments, 18, 3, np.float64)
+    found, weights = array(arguments, 15, np.int32), rows(arguments, 16, 3, np.float64)
+    distance = array(arguments, 17, np.float64)
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
     stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
     slack = _slack(boxes)
@@ -237,20 +246,21 @@ def _closest_triangles(arguments, low, high):
             continue
         p = _point(points, q)
         row = own[q] * n_group if grouped else 0
-        limit, closest = reach[q] * reach[q], NONE  # beyond nothing is found
+        closest = NONE
         u = v = w = 0.0
-        best = least = most = limit
+        best = least = most = np.inf
+        within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
         top, i = 0, 0
         gap = _gap2(boxes, 0, p, p)
         while True:
-            if gap <= most and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
+            if gap <= within and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
                 child = nodes[i, 0]
                 if child >= 0:
                     near, far = _gap2(boxes, child, p, p), _gap2(boxes, child + 1, p, p)
                     i, child = child, child + 1
                     if far < near:
                         i, child, near, far = child, i, far, near
-                    if far <= most:
+                    if far <= within:
                         stack[top], gaps[top] = child, far
                         top += 1
                     gap = near
@@ -259,7 +269,9 @@ def _closest_triangles(arguments, low, high):
                     a, b, c = _point(x, cells[e, 0]), _point(x, cells[e, 1]), _point(x, cells[e, 2])
                     weight, offset, d2 = closest_on_triangle(p, a, b, c)
                     t = order[e]
-                    if not d2 <= most or d2 > limit or (d2 >= least and t > closest):  # not a number is not found
+                    if not d2 <= most or (d2 >= least and t > closest):  # not a number is not found
+                        continue
+                    if d2 > _squared(reach[q] + max(margin[cells[e, 0]], margin[cells[e, 1]], margin[cells[e, 2]])):
                         continue
                     if behind and not dot(offset, cross(sub(b, a), sub(c, a))) > 0.0:
                         continue
@@ -270,6 +282,7 @@ def _closest_triangles(arguments, low, high):
                     best, closest = d2, t
                     u, v, w = weight
                     least, most = _same(best, slack)
+                    within = min(within, most)
             if top == 0:
                 break
             top -= 1
@@ -286,9 +299,10 @@ def _closest_edges(arguments, low, high):
     order, cells, x = array(arguments, 2, np.int32), rows(arguments, 3, 2, np.int32), rows(arguments, 4, 3, np.float64)
     reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
     own, start, ids = array(arguments, 8, np.int32), array(arguments, 10, np.int64), array(arguments, 11, np.int32)
-    edges, found = rows(arguments, 12, 2, np.int32), array(arguments, 13, np.int32)
-    s, t = array(arguments, 14, np.float64), array(arguments, 15, np.float64)
-    distance = array(arguments, 16, np.float64)
+    margin = array(arguments, 12, np.float64)
+    edges, found = rows(arguments, 13, 2, np.int32), array(arguments, 14, np.int32)
+    s, t = array(arguments, 15, np.float64), array(arguments, 16, np.float64)
+    distance = array(arguments, 17, np.float64)
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
     stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
     slack = _slack(boxes)
@@ -301,20 +315,21 @@ def _closest_edges(arguments, low, high):
         lowest = min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2])
         highest = max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2])
         row = own[q] * n_group if grouped else 0
-        limit, closest = reach[q] * reach[q], NONE  # beyond nothing is found
+        closest = NONE
         along, across = 0.0, 0.0
-        best = least = most = limit
+        best = least = most = np.inf
+        within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
         top, i = 0, 0
         gap = _gap2(boxes, 0, lowest, highest)
         while True:
-            if gap <= most and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
+            if gap <= within and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
                 child = nodes[i, 0]
                 if child >= 0:
                     near, far = _gap2(boxes, child, lowest, highest), _gap2(boxes, child + 1, lowest, highest)
                     i, child = child, child + 1
                     if far < near:
                         i, child, near, far = child, i, far, near
-                    if far <= most:
+                    if far <= within:
                         stack[top], gaps[top] = child, far
                         top += 1
                     gap = near
@@ -325,12 +340,15 @@ def _closest_edges(arguments, low, high):
                         continue
                     s1, t1, _, d2 = closest_segments(a, b, _point(x, c), _point(x, d))
                     edge = order[e]
-                    if not d2 <= most or d2 > limit or (d2 >= least and edge > closest):
+                    if not d2 <= most or (d2 >= least and edge > closest):
+                        continue
+                    if d2 > _squared(reach[q] + max(margin[c], margin[d])):
                         continue
                     if listed and (_is_listed(start, ids, v, edge) or _is_listed(start, ids, w, edge)):
                         continue
                     best, closest, along, across = d2, edge, s1, t1
                     least, most = _same(best, slack)
+                    within = min(within, most)
             if top == 0:
                 break
             top -= 1
@@ -348,11 +366,11 @@ def _containing_tets(arguments, low, high):
     own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
     start, ids = array(arguments, 10, np.int64), array(arguments, 11, np.int32)
     points, numbers, found = (
-        rows(arguments, 12, 3, np.float64),
-        array(arguments, 13, np.int64),
-        array(arguments, 14, np.int32),
+        rows(arguments, 13, 3, np.float64),
+        array(arguments, 14, np.int64),
+        array(arguments, 15, np.int32),
     )
-    weights = rows(arguments, 15, 4, np.float64)
+    weights = rows(arguments, 16, 4, np.float64)
     grouped, n_group, listed, named = sizes[0], sizes[1], sizes[2], numbers[0]
     stack = scratch(DEPTH, np.int32)
     for q in range(low, high):
