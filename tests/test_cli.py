@@ -248,7 +248,7 @@ def test_ctrl_c_keeps_the_finished_frames(tmp_path):
         _, said = child.communicate(timeout=60)
     finally:
         child.kill()
-    assert child.returncode == 130
+    assert child.returncode == 130, said
     run = pbng.read_run(tmp_path / "run")
     assert len(run) >= 3
     assert np.isfinite(run[len(run) - 1].x).all()

@@ -213,6 +213,28 @@ def test_full_disk_costs_only_the_frame_being_written(tmp_path, monkeypatch, fai
     assert [frame.x.tobytes() for frame in Run(tmp_path / "run")] == [frame.x.tobytes() for frame in made]
 
 
+def test_ctrl_c_waits_for_the_frame_that_is_being_written(tmp_path, monkeypatch):
+    made = list(frames([box()], 2))
+    savez = np.savez
+
+    def interrupted(*arguments, **arrays):
+        signal.raise_signal(signal.SIGINT)
+        savez(*arguments, **arrays)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with FrameWriter(tmp_path / "run") as out:
+            out.write(made[0])
+            monkeypatch.setattr(np, "savez", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                out.write(made[1])
+            assert out.n_written == 2
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert [frame.x.tobytes() for frame in Run(tmp_path / "run")] == [frame.x.tobytes() for frame in made]
+
+
 def test_misfit_frames_are_refused(tmp_path):
     frame = next(frames([box()], 1))
     frame.x = frame.x[:-1]

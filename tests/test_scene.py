@@ -311,7 +311,7 @@ def test_bodies_are_named_and_placed():
         scene.add(mesh, RUBBER, name="bar")
     with pytest.raises(pbng.InputError, match="expected a TetMesh or TriMesh, not int"):
         scene.add(3, RUBBER)
-    with pytest.raises(pbng.InputError, match="at must be 3 finite numbers"):
+    with pytest.raises(pbng.InputError, match="at: expected 3 finite numbers"):
         scene.add(mesh, RUBBER, at=(0, np.nan, 0))
 
 
@@ -328,7 +328,7 @@ def test_surfaces_in_space_are_no_solids():
 
 
 def test_bad_gravity_is_named():
-    with pytest.raises(pbng.InputError, match="gravity must be 3 finite numbers"):
+    with pytest.raises(pbng.InputError, match="gravity: expected 3 finite numbers"):
         pbng.Scene(gravity=(0, np.nan, 0))
 
 

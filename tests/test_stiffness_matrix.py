@@ -225,7 +225,7 @@ def test_bad_input_is_named():
 
     class Strange(ElementKind):
         name = "strange"
-        width = gradients = volume = pack = sweep = energy = forces = None
+        width = gradients = volume = pack = sweep = energy = forces = compound_pack = compound_sweep = None
 
     with pytest.raises(pbng.InputError, match="elements of kind 'strange' have no Hessian"):
         check_kind(Strange())

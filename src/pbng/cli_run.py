@@ -117,7 +117,7 @@ def _write(coming: Iterator[Any], writer: FrameWriter, watch: "_Watch", report: 
             error.add_note(f"the {writer.n_written} frames before it are intact in {report.path}")
         raise
     finally:
-        report.written = writer.count()
+        report.written = writer.n_written
 
 
 @contextmanager

@@ -69,7 +69,6 @@ class Toucher:
         self.detector = Detector(problem.contact, problem.X, problem.fixed)
         self.contacts = Contacts()
         self.size = float(np.linalg.norm(np.ptp(problem.X, axis=0)))
-        self.reach = self.detector.reach
         self.checked = False
         self.began()
 
@@ -171,7 +170,7 @@ def equilibrium(
     results: list[Result] = []
     left, state, start = budget, placed, x
     before: np.ndarray | None = x
-    ahead, far, moved = toucher.size, toucher.reach, [0.0]  # at first anything may come to touch
+    ahead, far, moved = toucher.size, toucher.detector.reach, [0.0]  # at first anything may come to touch
     for number in range(ROUNDS):
         contacts = toucher.find(start, state, t0, t, ahead=ahead, hold=max(HOLD * EASE**number, LEAST_HOLD))
         state = begun = contacts.put_outside(state)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pbng.checks import checked_vector
 from pbng.errors import InputError
 
 
@@ -57,7 +58,7 @@ class Translate(Affine):
     by: Sequence[float]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "by", _vector("Translate", self.by))
+        object.__setattr__(self, "by", checked_vector("Translate", self.by))
 
     def shift(self, s: float, center: np.ndarray) -> np.ndarray:
         return s * np.asarray(self.by)
@@ -75,12 +76,12 @@ class Rotate(Affine):
         named = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
         if isinstance(self.axis, str) and self.axis not in named:
             raise InputError(f"Rotate: axis must be 'x', 'y', 'z' or a vector, not {self.axis!r}")
-        axis = np.array(_vector("Rotate", named[self.axis] if isinstance(self.axis, str) else self.axis))
+        axis = np.array(checked_vector("Rotate", named[self.axis] if isinstance(self.axis, str) else self.axis))
         if not np.linalg.norm(axis) > 0:
             raise InputError("Rotate: the axis has no direction")
         object.__setattr__(self, "axis", tuple(axis / np.linalg.norm(axis)))
         if self.center is not None:
-            object.__setattr__(self, "center", _vector("Rotate: center", self.center))
+            object.__setattr__(self, "center", checked_vector("Rotate: center", self.center))
         if not math.isfinite(self.turns):
             raise InputError(f"Rotate: turns must be finite, not {self.turns}")
 
@@ -102,9 +103,9 @@ class Scale(Affine):
 
     def __post_init__(self) -> None:
         factors = (float(self.by),) * 3 if np.isscalar(self.by) else self.by  # type: ignore[arg-type]
-        object.__setattr__(self, "by", _vector("Scale", factors))
+        object.__setattr__(self, "by", checked_vector("Scale", factors))
         if self.center is not None:
-            object.__setattr__(self, "center", _vector("Scale: center", self.center))
+            object.__setattr__(self, "center", checked_vector("Scale: center", self.center))
 
     def linear(self, s: float) -> np.ndarray:
         return np.diag(1 + s * (np.asarray(self.by) - 1))
@@ -192,13 +193,6 @@ def as_motion(motion: Any) -> Motion:
     if callable(motion):
         return Function(motion)
     raise InputError(f"expected a motion (Rotate, Translate, ...) or a function of (t, X), not {motion!r}")
-
-
-def _vector(what: str, values: Any) -> tuple[float, ...]:
-    vector = tuple(float(v) for v in values)
-    if len(vector) != 3 or not all(math.isfinite(v) for v in vector):
-        raise InputError(f"{what}: expected 3 finite numbers, not {vector}")
-    return vector
 
 
 def _about(own: Sequence[float] | None, center: np.ndarray, L: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pbng.bindings import Binding, bind, weak_constraints
 from pbng.bodies import Body, Points, Selection
+from pbng.checks import checked_vector
 from pbng.contact.collider import Collider
 from pbng.contact.surfaces import ContactRule, contact_spec, has_surface
 from pbng.elements.base import ElementKind
@@ -47,7 +48,7 @@ class Scene:
 
     def __init__(self, gravity: Sequence[float] = (0.0, 0.0, 0.0), name: str = "scene") -> None:
         self.name = name
-        self.gravity = _vector("gravity", gravity)
+        self.gravity = checked_vector("gravity", gravity)
         self.bodies: list[Body] = []
         self._waits: list[float] = []  # of each body
         self._moves: list[_Move] = []
@@ -86,7 +87,7 @@ class Scene:
         if not isinstance(mesh, Mesh):
             raise InputError(f"body {name!r}: expected a TetMesh or TriMesh, not {type(mesh).__name__}")
         if at is not None:
-            mesh = _translated(mesh, np.array(_vector(f"body {name!r}: at", at)))
+            mesh = _translated(mesh, np.array(checked_vector(f"body {name!r}: at", at)))
         start = sum(b.mesh.n_vert for b in self.bodies)
         if not (math.isfinite(wait) and wait >= 0):
             raise InputError(f"body {name!r}: wait must be finite and not negative, not {wait}")
@@ -125,7 +126,7 @@ class Scene:
     def force(self, selection: Selection, force: Sequence[float]) -> None:
         """Spread a total force [N] evenly over vertices."""
         index = self._checked("force", selection)
-        self._forces.append((index, np.tile(np.array(_vector("force", force)) / len(index), (len(index), 1))))
+        self._forces.append((index, np.tile(np.array(checked_vector("force", force)) / len(index), (len(index), 1))))
 
     def traction(self, selection: Selection, traction: Sequence[float]) -> None:
         """Apply a traction [N/m²] to the part of the surface whose triangles' vertices are all selected, Eq. (16).
@@ -142,7 +143,7 @@ class Scene:
             measure = np.linalg.norm(mesh.X[faces[:, 1]] - mesh.X[faces[:, 0]], axis=1)
         share = np.zeros(mesh.n_vert)
         np.add.at(share, faces, (measure / faces.shape[1])[:, None])
-        self._forces.append((index, np.outer(share[index - start], np.array(_vector("traction", traction)))))
+        self._forces.append((index, np.outer(share[index - start], np.array(checked_vector("traction", traction)))))
 
     def bind(
         self,
@@ -439,10 +440,3 @@ def _check_times(what: str, over: float, start: float) -> None:
 def _check_until(what: str, until: float) -> None:
     if not until > 0:
         raise InputError(f"{what}: until must be positive, not {until}")
-
-
-def _vector(what: str, values: Any) -> tuple[float, ...]:
-    vector = tuple(float(v) for v in values)
-    if len(vector) != 3 or not all(math.isfinite(v) for v in vector):
-        raise InputError(f"{what} must be 3 finite numbers, not {vector}")
-    return vector

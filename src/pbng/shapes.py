@@ -1,10 +1,10 @@
 """Meshes of simple shapes: those of the paper, of tests, examples and benchmarks."""
 
 from collections.abc import Sequence
-from math import isfinite
 
 import numpy as np
 
+from pbng.checks import checked_vector
 from pbng.errors import InputError
 from pbng.mesh import TetMesh, TriMesh
 
@@ -31,7 +31,7 @@ def box(
         InputError: A size is not positive or a count is below 2.
     """
     n = _counts("box", vertices, 3)
-    axes = [o + np.linspace(0, s, m) for o, s, m in zip(_point("origin", origin, 3), _sizes("box", size, 3), n)]
+    axes = [o + np.linspace(0, s, m) for o, s, m in zip(checked_vector("origin", origin, 3), _sizes("box", size, 3), n)]
     X = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     return TetMesh(X, _five_tets(n))
 
@@ -61,7 +61,7 @@ def sphere(radius: float = 1.0, vertices: int = 16, center: Sequence[float] = (0
     (radius,) = _sizes("sphere", (radius,), 1)
     cube = box((2.0, 2.0, 2.0), vertices, (-1.0, -1.0, -1.0))
     X = _rounded(cube.X)
-    return TetMesh(radius * X + _point("center", center, 3), cube.cells)
+    return TetMesh(radius * X + checked_vector("center", center, 3), cube.cells)
 
 
 def cylinder(radius: float = 0.5, length: float = 2.0, vertices: Sequence[int] | int = 12) -> TetMesh:
@@ -106,7 +106,7 @@ def sheet(
         origin: The corner of least x and z [m].
     """
     flat, cells = _two_triangles("sheet", size, vertices, (0.0, 0.0))
-    X = np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]]) + _point("origin", origin, 3)
+    X = np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]]) + checked_vector("origin", origin, 3)
     return TriMesh(X, cells[:, [0, 2, 1]])
 
 
@@ -115,7 +115,7 @@ def _two_triangles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 2) and triangles (m, 3) of a grid, counter-clockwise."""
     n = _counts(what, vertices, 2)
-    axes = [o + np.linspace(0, s, m) for o, s, m in zip(_point("origin", origin, 2), _sizes(what, size, 2), n)]
+    axes = [o + np.linspace(0, s, m) for o, s, m in zip(checked_vector("origin", origin, 2), _sizes(what, size, 2), n)]
     X = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     i, j = (a.ravel() for a in np.meshgrid(*(np.arange(m - 1, dtype=np.int32) for m in n), indexing="ij"))
     a, b, c, d = i * n[1] + j, (i + 1) * n[1] + j, (i + 1) * n[1] + j + 1, i * n[1] + j + 1
@@ -126,17 +126,10 @@ def _two_triangles(
 
 
 def _sizes(what: str, sizes: Sequence[float], n: int) -> tuple[float, ...]:
-    sizes = _point(f"{what}: size", sizes, n)
+    sizes = checked_vector(f"{what}: size", sizes, n)
     if not all(s > 0 for s in sizes):
         raise InputError(f"{what}: sizes must be positive, not {sizes}")
     return sizes
-
-
-def _point(what: str, values: Sequence[float], n: int) -> tuple[float, ...]:
-    values = tuple(float(v) for v in values)
-    if len(values) != n or not all(isfinite(v) for v in values):
-        raise InputError(f"{what}: expected {n} finite numbers, not {values}")
-    return values
 
 
 def _counts(what: str, vertices: Sequence[int] | int, n: int) -> tuple[int, ...]:

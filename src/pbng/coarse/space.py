@@ -54,7 +54,8 @@ class CoarseSpace:
         self.parents, self.weights = np.zeros((n, 8), np.int32), np.zeros((n, 8))  # U, in the order of the blocks
         self.parents[place], self.weights[place] = parents[free], weights[free]
         up = weight_matrix(self.parents, self.weights, self.n_node)
-        self.up, self.touched = up, b""
+        self.up = up
+        self.touched: tuple[ContactEnergy, bytes] | None = None
         self.bearing = WALL * packed.stiffness
         down = up.T.tocsr()
         self.restriction = down.indptr.astype(np.int64), down.indices.astype(np.int32), down.data
@@ -121,12 +122,10 @@ class CoarseSpace:
 
     def touch(self, touching: ContactEnergy | None, x: np.ndarray, active: np.ndarray | None) -> None:
         """Take what touches at positions x (n, 3): the contacts and half-spaces that are ``active``."""
-        key, total = b"", self.tied
-        if touching is not None and active is not None:
-            key = touching.name + active.tobytes()
+        key = None if touching is None or active is None else (touching, active.tobytes())
         if key == self.touched:
             return
-        self.touched = key
+        self.touched, total = key, self.tied
         if touching is not None and active is not None and active.any():
             found = touching.hessian(x, active, self.bearing, self.up)
             total = found if total is None else (total + found).tobsr((3, 3))

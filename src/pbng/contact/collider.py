@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pbng.checks import checked_number
 from pbng.errors import InputError
 from pbng.motions import Affine, Motion, as_motion
 
@@ -263,17 +264,3 @@ def turned(pose: Pose | None, N: np.ndarray) -> np.ndarray:
 def norms(v: np.ndarray) -> np.ndarray:
     """Lengths (k,) of vectors (k, 3)."""
     return np.sqrt(np.einsum("ki,ki->k", v, v))
-
-
-def checked_number(what: str, value: Any, positive: bool = True) -> float:
-    number = float(value)
-    if not math.isfinite(number) or number < 0 or (positive and number == 0):
-        raise InputError(f"{what} must be finite and {'positive' if positive else 'not negative'}, not {value}")
-    return number
-
-
-def checked_vector(what: str, values: Any) -> tuple[float, ...]:
-    vector = tuple(float(v) for v in values)
-    if len(vector) != 3 or not all(math.isfinite(v) for v in vector):
-        raise InputError(f"{what}: expected 3 finite numbers, not {vector}")
-    return vector

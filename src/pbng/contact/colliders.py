@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pbng.contact.collider import Collider, checked_number, checked_vector, is_rigid, norms
+from pbng.checks import checked_number, checked_vector
+from pbng.contact.collider import Collider, is_rigid, norms
 from pbng.errors import InputError
 from pbng.motions import Affine
 

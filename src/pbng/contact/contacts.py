@@ -9,7 +9,6 @@ Stencils, normals and offsets are those of the start of the step: energies are c
 """
 
 from dataclasses import dataclass, field
-from itertools import count
 
 import numpy as np
 import scipy.sparse
@@ -19,7 +18,6 @@ from pbng.constraints import stencil_hessian
 CORNERS = 4  # vertices of a stencil: a vertex and a triangle, or two edges
 PARTINGS = 4  # rounds in which what overlaps is moved apart
 ROUNDS = 8  # of projections onto the half-spaces of one vertex
-_NAMES = count()
 
 
 def _none(*shape: int, dtype: type = float) -> np.ndarray:
@@ -110,7 +108,6 @@ class ContactEnergy:
 
     def __init__(self, contacts: Contacts, n: int, slot: np.ndarray, origin: np.ndarray) -> None:
         c, m = contacts, len(contacts.vertices)
-        self.name = next(_NAMES).to_bytes(8)  # tells one set of contacts from another
         row = np.repeat(np.arange(m), CORNERS)
         entries = c.weights.ravel(), (row, slot[c.vertices].ravel())
         self.weights = scipy.sparse.csr_matrix(entries, (m, n))

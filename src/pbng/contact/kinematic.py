@@ -18,7 +18,7 @@ from pbng.contact.collider import ON_SURFACE, Collider, Pose, Touches, is_rigid,
 from pbng.contact.crossing import first_crossings
 from pbng.contact.queries import closest_triangles
 from pbng.errors import InputError
-from pbng.mesh import Mesh
+from pbng.mesh import Mesh, triangle_areas
 from pbng.topology import TRIANGLE_EDGES
 
 PIECES = 16  # straight pieces at most that a step of a deforming mesh is cut into
@@ -36,8 +36,7 @@ class _Shape:
     @cached_property
     def faces(self) -> np.ndarray:
         """Unit normals (m, 3); zero for a triangle without area."""
-        a, b, c = self.x[self.triangles].transpose(1, 0, 2)
-        return _unit(np.cross(b - a, c - a))
+        return _unit(triangle_areas(self.x, self.triangles))
 
     @cached_property
     def vertices(self) -> np.ndarray:

@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+NEAR = 0.5  # at which distance surfaces count as close, in mean lengths of their edges
+CLOSE = 0.1  # the same in a step of a motion, to which twice what the step is expected to move is added
+
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:

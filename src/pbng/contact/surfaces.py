@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from pbng.bodies import Body
-from pbng.contact.spec import ContactSpec, Surfaces
+from pbng.contact.spec import NEAR, ContactSpec, Surfaces
 from pbng.errors import InputError
 from pbng.mesh import TetMesh
 
-NEAR = 0.5  # radius in mean lengths of the surfaces' edges
 CLOTH = 0.2  # distance kept from cloth of no thickness, in mean lengths of its edges
 
 

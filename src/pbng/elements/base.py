@@ -1,4 +1,4 @@
-"""What an element kind is: a stencil and four functions, each made for a material model and inlined into kernels.
+"""What an element kind is: a stencil and its functions, each made for a material model and inlined into kernels.
 
 Kernels work on *lanes*: W nodes (or elements) side by side, which LLVM turns into vector instructions. Arrays are flat
 and indices unsigned, because run-time strides and sign checks keep it from doing so. A position is four numbers, the

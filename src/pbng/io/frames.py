@@ -23,7 +23,7 @@ import numpy as np
 from pbng import __version__
 from pbng.errors import InputError
 from pbng.io.colliders import ColliderShape, colliders_of, shapes_of
-from pbng.io.store import mesh_arrays, packed, put, read_mesh, reading, temporary_of, unpacked
+from pbng.io.store import mesh_arrays, packed, put, read_mesh, reading, temporary_of, uninterrupted, unpacked
 from pbng.mesh import Mesh, TriMesh
 
 FORMAT = "pbng run"
@@ -153,12 +153,11 @@ class FrameWriter:
         if append:
             self.n_written = len(_in_order(path, frames))
 
-    def count(self) -> int:
-        """Frames on the disk: one more than ``n_written`` if Ctrl-C came when the last had just been put there."""
-        return max(self.n_written, len(_frame_files(self.path))) if self.n_written else 0
-
+    @uninterrupted()
     def write(self, frame: Any) -> None:
         """Add a frame: an object with ``index, t, x, result, problem`` as :func:`pbng.simulate` yields them.
+
+        Ctrl-C waits until it is done.
 
         Raises:
             InputError: The frame does not fit the run, or it could not be written (the disk is full, ...); the frames

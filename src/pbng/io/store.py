@@ -3,10 +3,12 @@
 import io
 import json
 import os
+import signal
+import threading
 import zipfile
 import zlib
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,6 +40,25 @@ def put(path: Path, data: bytes) -> None:
 def temporary_of(path: Path) -> Path:
     """The name a file has until it is whole."""
     return path.with_name(f".{path.name}.tmp")
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits until this is left: what is written is written whole, and what writes it need not expect it.
+
+    (An archive that is interrupted between two of its parts ends with an error of its own.)
+    """
+    if threading.current_thread() is not threading.main_thread():  # signals come to the main thread alone
+        yield
+        return
+    came: list[Any] = []
+    handler = signal.signal(signal.SIGINT, lambda *signal_: came.append(signal_))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if came and callable(handler):
+            handler(*came[0])
 
 
 def packed(**arrays: Any) -> bytes:

@@ -60,15 +60,19 @@ def run(
     status = _verdict(history, tolerance, floor, budget.error)
     iteration, correction = 0, 0.0
     seen = -1, x  # an iteration and the state after it
-    if status is None and before is not None and (better := method.prepare(before, x)) is not None:
-        better = contacts.put_outside(better) if contacts is not None else better
-        method.start(better, targets, contacts)
-        if refined:
-            method.refine()
-    if status is None and other is not None:
-        method.start(other, targets, contacts)
-        if not method.certify().energy < history.last.energy:
-            method.start(x, targets, contacts)
+    if status is None:
+
+        def begin(at: np.ndarray) -> None:
+            method.start(at, targets, contacts)
+            if refined:
+                method.refine()
+
+        if before is not None and (better := method.prepare(before, x)) is not None:
+            begin(contacts.put_outside(better) if contacts is not None else better)
+        if other is not None:
+            begin(other)
+            if not method.certify().energy < history.last.energy:
+                begin(x)
     try:
         while status is None:
             if iteration >= budget.cap:

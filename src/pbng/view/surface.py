@@ -15,6 +15,7 @@ from pbng.errors import InputError
 from pbng.io.colliders import ColliderShape, Part, behind, colliders_of, shapes_of
 from pbng.io.export import drawn
 from pbng.io.frames import Run
+from pbng.mesh import triangle_areas
 
 CREASE = 35.0  # [degrees] edges sharper than this at rest look sharp
 
@@ -155,7 +156,7 @@ class Surface:
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """Unit normals (n, 3) float32 at points (n, 3), the means of those of the triangles around, by area."""
-        face = _face_normals(points, self.triangles)
+        face = triangle_areas(points, self.triangles)
         corner = self.triangles.ravel()
         sums = [np.bincount(corner, np.repeat(face[:, i], 3), len(points)) for i in range(3)]
         normal = np.stack(sums, axis=1)
@@ -168,7 +169,7 @@ def creased(points: np.ndarray, triangles: np.ndarray, angle: float = CREASE) ->
 
     Returns ``source`` (n,), the point that each new point is a copy of, and the triangles (m, 3) of new points.
     """
-    normal = _face_normals(points, triangles)
+    normal = triangle_areas(points, triangles)
     length = np.linalg.norm(normal, axis=1)
     normal /= np.where(length > 0, length, 1)[:, None]
     # Half-edge 3 t + c of triangle t runs from its corner c to the next; the other half has the same pair of points.
@@ -194,8 +195,3 @@ def creased(points: np.ndarray, triangles: np.ndarray, angle: float = CREASE) ->
     source = np.empty(count, np.int64)
     source[label] = triangles.ravel()
     return source, label.reshape(-1, 3).astype(np.int64)
-
-
-def _face_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    p = points[triangles]
-    return np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
