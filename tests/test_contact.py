@@ -191,6 +191,21 @@ def test_what_starts_inside_comes_out():
     assert np.abs(frames[-1].v).max() < 2.0
 
 
+def test_a_thickness_that_leaves_rest_no_room_is_refused():
+    def sheet(thickness, rings):
+        scene = pbng.Scene()
+        cloth = scene.add(pbng.shapes.sheet((1.0, 1.0), 11), pbng.Membrane(E=1.0, nu=0.3), name="sheet")
+        scene.pin(cloth.where(x=0))
+        scene.contact(self_collision=True, thickness=thickness, rings=rings)
+        problem = scene.compile()
+        return Detector(problem.contact, problem.X, problem.fixed).find(problem.X, problem.X, 0, 0)
+
+    assert (sheet(0.06, 1).clearance(pbng.shapes.sheet((1.0, 1.0), 11).X) > 0).all()
+    sheet(0.1, 2)
+    with pytest.raises(pbng.InputError, match=r"'sheet' keeps 0.1 m from itself.* is 0.07071 m from a triangle"):
+        sheet(0.1, 1)
+
+
 def test_a_body_that_starts_inside_another_is_refused():
     scene = pbng.Scene()
     scene.add(pbng.shapes.box((1.0, 1.0, 1.0), 4), SOFT, name="out")

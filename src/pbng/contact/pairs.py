@@ -27,6 +27,7 @@ AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apar
 SHARP = 0.9  # cosine of the angle between the normals at an edge, below which it counts as sharp
 SLIPPED = 4.0  # how much closer a triangle must be by which a vertex does not face what it is inside of
 TOUCHING = 1e-9  # of the radius: closer points have no direction between them
+ROOM = 1e-6  # of the distance that is kept, by which surfaces at rest may be too close
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
 
 
@@ -78,8 +79,30 @@ class SurfaceDetector:
             cells = s.triangles, self.edges, s.tets
             self.near_triangles, self.near_edges, self.near_tets = (neighbourhoods(c, len(X), s.rings) for c in cells)
         self.radius = s.radius if s.radius is not None else NEAR * float(s.spacing[present].mean())
-        # Of each vertex, whether it was inside a solid of others, and of its own; at first nobody knows.
+        if self.any_own:
+            self._check_room(X)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Of each vertex, whether it was inside a solid of others, and of its own; at first nobody knows."""
         self.were_inside = [np.ones(len(self.vertex), bool), np.ones(len(self.vertex), bool)]
+
+    def _check_room(self, X: np.ndarray) -> None:
+        """InputError if what may touch itself is closer at rest than the distance that is kept: it would swell."""
+        s = self.surfaces
+        self._forget()
+        kept = 2 * s.skin[self.body]
+        pairs = self._vertex_triangle(X, kept, self.meets_itself, self.near_triangles)
+        distance = np.linalg.norm(pairs.first - pairs.second, axis=1)
+        short = kept[pairs.vertices[:, 0]] - distance
+        if len(short) and short.max() > ROOM * kept.max():
+            k = int(short.argmax())
+            v = pairs.vertices[k, 0]
+            raise InputError(
+                f"contact: body {s.names[self.body[v]]!r} keeps {kept[v]:.4g} m from itself, its thickness, but at rest"
+                f" its vertex at {tuple(X[v].round(6).tolist())} is {distance[k]:.4g} m from a triangle more than"
+                f" {s.rings} rings away; use a smaller thickness, or more rings"
+            )
 
     def _sharp_edges(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Edges that may touch edges, (k, 2), and the two triangles at each.
@@ -276,7 +299,7 @@ class SurfaceDetector:
         if self.tets is None or not self.several:
             return
         nothing = np.full(len(self.vertex), -1)
-        self.were_inside[False][:] = True
+        self._forget()
         x = np.ascontiguousarray(x, float)
         inside, _ = self._inside(x, nothing, np.zeros((len(nothing), 3)), self.meets_others, None)
         body = self.body[self.vertex]
