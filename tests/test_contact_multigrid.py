@@ -44,16 +44,14 @@ def test_cycles_do_not_grow_with_the_mesh_in_contact(friction):
     assert cycles[1] <= 12
 
 
-def test_cycles_of_a_stack():
-    cycles = []
-    for n in (9, 13):
-        frames = list(pbng.simulate(stacked(n), pbng.MultigridPBNG(), pbng.Budget(rtol=1e-3), frames=6))
-        assert all(f.result.status is pbng.Status.CONVERGED for f in frames)
-        assert frames[-1].contact.pairs > 10
-        assert frames[-1].result.inverted == 0
-        cycles.append(max(f.result.iterations for f in frames))
-    assert cycles[1] <= cycles[0] + 5
-    assert cycles[1] <= 30
+@pytest.mark.parametrize("n", [5, 9, 13])
+def test_cycles_of_a_stack(n):
+    """Vertices lie upon vertices and on edges, where the closest triangle changes with every movement: rounds settle."""
+    frames = list(pbng.simulate(stacked(n), pbng.MultigridPBNG(), pbng.Budget(rtol=1e-3), frames=8))
+    assert all(f.result.status is pbng.Status.CONVERGED for f in frames)
+    assert frames[-1].contact.pairs > 10
+    assert frames[-1].result.inverted == 0
+    assert max(f.result.iterations for f in frames) <= 16
 
 
 @pytest.mark.parametrize("scene", [squeezed(9), squeezed(9, 0.3), stacked(6)], ids=["ball", "rough plates", "stack"])

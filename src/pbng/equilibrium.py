@@ -17,11 +17,8 @@ from pbng.solvers.pbng import PackedMethod
 
 ROUNDS, LATELY = 100, 10  # in which contacts are found anew; of these, how many may bring nothing
 SLOWEST = 0.9  # rate at which rounds are supposed to move less and less, at most
-HOLD, EASE, LEAST_HOLD = (
-    0.1,
-    0.5,
-    1e-3,
-)  # of k_n: how contacts hold on in the first round, less in each further, at least
+HOLD, MOST_HOLD, EASE = 1e-3, 0.1, 0.5  # of k_n: how contacts hold on at first, at most; by how much less each round
+TIGHTEN = 10.0  # by how much more where a round begins farther from rest than the one before
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +168,9 @@ def equilibrium(
     left, state, start = budget, placed, x
     before: np.ndarray | None = x
     ahead, far, moved = toucher.size, toucher.detector.reach, [0.0]  # at first anything may come to touch
-    for number in range(ROUNDS):
-        contacts = toucher.find(start, state, t0, t, ahead=ahead, hold=max(HOLD * EASE**number, LEAST_HOLD))
+    hold = HOLD
+    for _ in range(ROUNDS):
+        contacts = toucher.find(start, state, t0, t, ahead=ahead, hold=hold)
         state = begun = contacts.put_outside(state)
 
         def leave(x: np.ndarray, begun: np.ndarray = begun) -> bool:
@@ -190,6 +188,8 @@ def equilibrium(
         if _stagnates([r.residuals[0] for r in results]):
             results[-1] = replace(result, status=Status.CONTACTS)
             break
+        farther = len(results) > 2 and result.residuals[0] > results[-2].residuals[0]
+        hold = min(TIGHTEN * hold, MOST_HOLD) if farther else EASE * hold
         moved.append(_most(state, now))
         state = start = now
         t0, before, ahead = t, None, far

@@ -14,6 +14,7 @@ import numpy as np
 
 from pbng.contact.bvh import BoxTree
 from pbng.contact.contacts import Contacts
+from pbng.contact.normals import SmoothNormals
 from pbng.contact.queries import closest_edges, closest_triangles, containing_tets
 from pbng.contact.rings import neighbourhoods
 from pbng.contact.spec import CLOSE, NEAR, Surfaces
@@ -33,7 +34,7 @@ SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a verte
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Candidates: stencils, the two points of each [m], and a normal of the second side that points outward."""
+    """Candidates: stencils, the two points of each [m], and a unit normal of the second side that points outward."""
 
     vertices: np.ndarray
     weights: np.ndarray
@@ -68,6 +69,7 @@ class SurfaceDetector:
         self.edges, self.beside = self._sharp_edges(X)
         edge_body = self.body[self.edges[:, 0]]
         self.around = neighbourhoods(s.triangles, len(X), 1)
+        self.normals = SmoothNormals(X, s.triangles)
         self.triangles = BoxTree(X, s.triangles, s.body)
         self.edge_tree = BoxTree(X, self.edges, edge_body)
         self.tets = BoxTree(X, s.tets, s.tet_body) if len(s.tets) else None
@@ -166,7 +168,7 @@ class SurfaceDetector:
             weights=np.column_stack([np.ones(len(found)), -weights[found]]),
             first=x[v],
             second=np.einsum("kj,kji->ki", weights[found], x[corners]),
-            outward=triangle_areas(x, corners),
+            outward=self.normals.at(x, triangle[found], weights[found]),
             inside=inside[found] >= 0,
             bodies=np.column_stack([own[found], s.body[triangle[found]]]),
         )
@@ -245,6 +247,7 @@ class SurfaceDetector:
         solid = self.solid[bodies].all(1)
         # Two solids overlap where each has its edge inside the other; two edges of one see each other through it.
         inside = solid & (ahead < 0) & (back > 0)
+        across /= np.maximum(np.linalg.norm(across, axis=1), 1e-300)[:, None]
         outward = np.where(((across * theirs_out).sum(1) < 0)[:, None], -across, across)
         pairs = _Pairs(stencil, weights, first, second, outward, inside, bodies)
         # Deep in each other, two edges tell nothing of the way out; vertices do.
@@ -270,11 +273,16 @@ class SurfaceDetector:
         p = p.some(~self.fixed[p.vertices].all(1))
         apart = p.first - p.second
         distance = np.linalg.norm(apart, axis=1)
-        outward = p.outward / np.maximum(np.linalg.norm(p.outward, axis=1), 1e-300)[:, None]
         sign = np.where(p.inside, -1.0, 1.0)
-        clear = distance > TOUCHING * self.radius
-        normal = np.where(clear[:, None], (sign / np.maximum(distance, 1e-300))[:, None] * apart, outward)
         gap = sign * distance
+        clear = distance > TOUCHING * self.radius
+        direct = np.where(clear[:, None], (sign / np.maximum(distance, 1e-300))[:, None] * apart, p.outward)
+        # Where the way to the closest point is nearly along the surface's normal, it is the normal that counts: it does
+        # not jump from triangle to triangle. On the far side of cloth it points back.
+        along = (direct * p.outward).sum(1)
+        share = np.clip((np.abs(along) - SHARP) / (1 - SHARP), 0.0, 1.0)
+        normal = (1 - share)[:, None] * direct + (share * np.sign(along))[:, None] * p.outward
+        normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
         kept = s.skin[p.bodies].sum(1)
         spacing = s.spacing[p.bodies].min(1)
         softer = s.stiffness[p.bodies].min(1)
