@@ -19,9 +19,10 @@ import scipy.sparse
 
 from pbng.dispatch import call, specialised
 from pbng.elements.base import parameters
-from pbng.elements.hinge import LEAST as LEAST_AREA, Hinge, fold
+from pbng.elements.hinge import Hinge, fold, gradients, least_squares
+from pbng.elements.membrane import plane_gradients
 from pbng.jit import inline, serial
-from pbng.linalg import combine, cross, dot, scale, sub
+from pbng.linalg import combine, cross, dot, scale
 from pbng.materials.base import Model
 from pbng.parallel import array, body, each, rows
 from pbng.problem import ElementGroup, Problem
@@ -115,13 +116,8 @@ def _expanded(
 
 def _membrane_data(group: ElementGroup, X: np.ndarray) -> np.ndarray:
     """Gradients of the shape functions (3, 2), the first axis along an edge, the area and the floor, (n, 8)."""
-    a, e = X[:, 1] - X[:, 0], X[:, 2] - X[:, 0]
-    length, twice = np.linalg.norm(a, axis=1), np.linalg.norm(np.cross(a, e), axis=1)
-    data = np.zeros((len(X), 8))
-    data[:, 2], data[:, 3], data[:, 5] = 1 / length, -(a * e).sum(1) / (length * twice), length / twice
-    data[:, 0], data[:, 1] = -data[:, 2], -data[:, 3] - data[:, 5]
-    data[:, 6], data[:, 7] = twice / 2, FLOOR * group.block().a
-    return data
+    floor = np.full(len(X), FLOOR * group.block().a)
+    return np.column_stack([plane_gradients(X).reshape(-1, 6), group.kind.volume(X), floor])
 
 
 @cache
@@ -231,9 +227,7 @@ def _decomposed(F0, F1):
 
 def _hinge_data(group: ElementGroup, X: np.ndarray) -> np.ndarray:
     """w k and the least |n|², (n, 2)."""
-    e, a, b = (X[:, k] - X[:, 0] for k in (1, 2, 3))
-    smaller = np.minimum((np.cross(e, a) ** 2).sum(1), (np.cross(b, e) ** 2).sum(1))
-    return np.column_stack([group.kind.volume(X) * group.block().a, LEAST_AREA**2 * smaller])
+    return np.column_stack([group.kind.volume(X) * group.block().a, least_squares(X)])
 
 
 @body
@@ -248,12 +242,7 @@ def _hinges(arguments, low, high):
     for t in range(low, high):
         x0, x1, x2, x3 = _at(x, place[t, 0]), _at(x, place[t, 1]), _at(x, place[t, 2]), _at(x, place[t, 3])
         _angle, e, length, unit, a, b, p, q = fold(x0, x1, x2, x3, data[t, 1])
-        g = (
-            combine(dot(sub(e, a), unit), p, dot(sub(e, b), unit), q),
-            combine(dot(a, unit), p, dot(b, unit), q),
-            scale(-length, p),
-            scale(-length, q),
-        )
+        g = gradients(e, length, unit, a, b, p, q)
         for i in range(4):
             for j in range(4):
                 for k in range(3):

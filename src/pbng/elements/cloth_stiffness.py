@@ -11,13 +11,12 @@ import numpy as np
 
 from pbng.dispatch import call, specialised
 from pbng.elements.base import parameters
-from pbng.elements.hinge import LEAST, Hinge
-from pbng.elements.membrane import SurfaceTriangle
+from pbng.elements.hinge import Hinge, least_squares, normals
+from pbng.elements.membrane import SurfaceTriangle, plane_gradients
 from pbng.errors import InputError
 from pbng.jit import inline
 from pbng.linalg import combine, dot
 from pbng.materials.base import Model
-from pbng.materials.bending import Bending
 from pbng.materials.differentials import STEP
 from pbng.parallel import array, body, each, rows
 
@@ -34,6 +33,7 @@ class ClothStiffness:
         self.group, self.cells, self.X = group, group.cells, X[group.cells]
         if not isinstance(group.kind, SurfaceTriangle | Hinge):
             raise InputError(f"Newton: elements of kind {group.kind.name!r} have no Hessian; use PBNG")
+        self.angle0 = _angle(self.X, self.X)[0] if isinstance(group.kind, Hinge) and group.kind.curved else 0.0
 
     def evaluate(self, x: np.ndarray, projection: str, floor: float) -> np.ndarray:
         """∂²E/∂x_a∂x_c [N/m] at x (n_vert, 3) for each pair of corners a, c, (n, corners, corners, 3, 3).
@@ -43,7 +43,7 @@ class ClothStiffness:
         """
         now = np.ascontiguousarray(x[self.cells], float)
         if isinstance(self.group.kind, Hinge):
-            return _hinges(self.group.kind, self.group.material, now, self.X, projection)
+            return _hinges(self.group, now, self.X, self.angle0, projection)
         return _membranes(self.group, now, self.X, projection, floor)
 
 
@@ -60,17 +60,13 @@ def projected(A: np.ndarray, projection: str, floor: float) -> np.ndarray:
 
 
 def _membranes(group: Any, x: np.ndarray, X: np.ndarray, projection: str, floor: float) -> np.ndarray:
-    a, e = X[:, 1] - X[:, 0], X[:, 2] - X[:, 0]
-    length, twice = np.linalg.norm(a, axis=1), np.linalg.norm(np.cross(a, e), axis=1)
-    G = np.zeros((len(x), 3, 2))  # gradients of the shape functions, the first axis along a
-    G[:, 1, 0], G[:, 1, 1], G[:, 2, 1] = 1 / length, -(a * e).sum(1) / (length * twice), length / twice
-    G[:, 0] = -G[:, 1] - G[:, 2]
+    G = plane_gradients(X)
     F = np.ascontiguousarray(np.einsum("nai,nak->nki", x, G)).reshape(-1, 6)
     numbers = np.array(group.material.parameters(), float)
     H = np.empty((len(x), 36))
     each(change_of_stress(group.term.model), (F, numbers, H), len(x), grain=256)
     H = projected(H.reshape(-1, 6, 6), projection, floor * group.block().a).reshape(-1, 2, 3, 2, 3)
-    return np.einsum("n,nak,nkimj,ncm->nacij", twice / 2, G, H, G, optimize=True)
+    return np.einsum("n,nak,nkimj,ncm->nacij", group.kind.volume(X), G, H, G, optimize=True)
 
 
 @cache
@@ -123,14 +119,13 @@ def make_change(key: str) -> Any:
 # ---------------------------------------------------------------------------------------------------------- hinges
 
 
-def _hinges(kind: Hinge, bending: Bending, x: np.ndarray, X: np.ndarray, projection: str) -> np.ndarray:
+def _hinges(group: Any, x: np.ndarray, X: np.ndarray, angle0: np.ndarray | float, projection: str) -> np.ndarray:
     """w k (g gᵀ + (θ - θ₀) ∂²θ/∂x∂x)."""
     angle, gradient, hessian = _angle(x, X)
-    if kind.curved:
-        angle = np.remainder(angle - _angle(X, X)[0] + np.pi, 2 * np.pi) - np.pi
-    angle, g = angle[:, None, None], gradient.reshape(-1, 12)
+    angle = (np.remainder(angle - angle0 + np.pi, 2 * np.pi) - np.pi)[:, None, None]
+    g = gradient.reshape(-1, 12)
     K = projected(g[:, :, None] * g[:, None] + angle * hessian, projection, 0.0)
-    K *= bending.k * kind.volume(X)[:, None, None]
+    K *= group.material.k * group.kind.volume(X)[:, None, None]
     return K.reshape(-1, 4, 3, 4, 3).transpose(0, 1, 3, 2, 4)
 
 
@@ -139,9 +134,8 @@ def _angle(x: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
 
     The second are those of the first along twelve directions.
     """
-    rest = _normals(X)
-    least = LEAST**2 * np.minimum((rest[0] ** 2).sum(1), (rest[1] ** 2).sum(1))[:, None]
-    n1, n2 = _normals(x)
+    least = least_squares(X)[:, None]
+    n1, n2 = normals(x)
     e, a, b = (x[:, k] - x[:, 0] for k in (1, 2, 3))
     length = np.linalg.norm(e, axis=1, keepdims=True)
     unit = e / np.maximum(length, 1e-18)
@@ -167,11 +161,6 @@ def _angle(x: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     second += [-dlength * p - length * dp, -dlength * q - length * dq]
     hessian = np.stack(second, axis=2).reshape(-1, 12, 12)
     return angle, gradient, (hessian + hessian.transpose(0, 2, 1)) / 2
-
-
-def _normals(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    e, a, b = (x[:, k] - x[:, 0] for k in (1, 2, 3))
-    return np.cross(e, a), np.cross(b, e)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -48,6 +48,17 @@ def fold(x0, x1, x2, x3, least):
 
 
 @inline
+def gradients(e, length, unit, a, b, p, q):
+    """∂θ/∂x₀ to ∂θ/∂x₃ from what :func:`fold` returns."""
+    return (
+        combine(dot(sub(e, a), unit), p, dot(sub(e, b), unit), q),
+        combine(dot(a, unit), p, dot(b, unit), q),
+        scale(-length, p),
+        scale(-length, q),
+    )
+
+
+@inline
 def turned(angle, angle0):
     """θ - θ₀, taken into [-π, π]: so the energy does not jump where θ does."""
     real = type(angle)
@@ -80,6 +91,17 @@ def add_nothing(acc, l, h):
     """What the paper's block (37) adds besides g gᵀ."""
 
 
+def least_squares(X: np.ndarray) -> np.ndarray:
+    """The least |n|² of :func:`fold`, (n,), of corners at rest, (n, 4, 3)."""
+    return LEAST**2 * np.minimum(*((n**2).sum(1) for n in normals(X)))
+
+
+def normals(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """n₁ and n₂ (n, 3) of corners (n, 4, 3)."""
+    e, a, b = (x[:, k] - x[:, 0] for k in (1, 2, 3))
+    return np.cross(e, a), np.cross(b, e)
+
+
 class Hinge(ElementKind):
     """Hinges, with Eq. (35)'s weight or the weight that does not depend on the mesh, and θ₀ zero or at rest."""
 
@@ -101,7 +123,8 @@ class Hinge(ElementKind):
 
     def gradients(self, X: np.ndarray) -> np.ndarray:
         e, a, b = (X[:, k] - X[:, 0] for k in (1, 2, 3))
-        n1, n2, length = np.cross(e, a), np.cross(b, e), np.linalg.norm(e, axis=1, keepdims=True)
+        n1, n2 = normals(X)
+        length = np.linalg.norm(e, axis=1, keepdims=True)
         p, q = n1 / (n1**2).sum(1, keepdims=True), n2 / (n2**2).sum(1, keepdims=True)
         s2, s3 = ((v * e).sum(1, keepdims=True) / length**2 for v in (a, b))
         return np.stack(
@@ -111,9 +134,8 @@ class Hinge(ElementKind):
     def volume(self, X: np.ndarray) -> np.ndarray:
         if not self.weighted:
             return np.ones(len(X))
-        e, a, b = (X[:, k] - X[:, 0] for k in (1, 2, 3))
-        area = np.linalg.norm(np.cross(e, a), axis=1) + np.linalg.norm(np.cross(b, e), axis=1)
-        return 6 * (e**2).sum(1) / area
+        area = sum(np.linalg.norm(n, axis=1) for n in normals(X))
+        return 6 * ((X[:, 1] - X[:, 0]) ** 2).sum(1) / area
 
     @cache
     def _rest(self) -> Any:
@@ -220,9 +242,8 @@ class Hinge(ElementKind):
                 x0, x1, x2, x3 = wide_vec(gx, j), wide_vec(gx, j + _Q), wide_vec(gx, j + _R), wide_vec(gx, j + _S)
                 angle, e, length, unit, a, b, u, v = fold(x0, x1, x2, x3, least)
                 M = -weight * moment(turned(angle, angle0), *number)
-                f0 = combine(M * dot(sub(e, a), unit), u, M * dot(sub(e, b), unit), v)
-                f1 = combine(M * dot(a, unit), u, M * dot(b, unit), v)
-                f2, f3 = scale(-M * length, u), scale(-M * length, v)
+                g0, g1, g2, g3 = gradients(e, length, unit, a, b, u, v)
+                f0, f1, f2, f3 = scale(M, g0), scale(M, g1), scale(M, g2), scale(M, g3)
                 out[l], out[_1 + l], out[_2 + l] = f0
                 out[_3 + l], out[_4 + l], out[_5 + l] = f1
                 out[_6 + l], out[uint64(7 * W) + l], out[_8 + l] = f2

@@ -72,6 +72,16 @@ def add_paper_block(acc, l, h, F):
     add_outer(acc, l, h, paper_direction(F))
 
 
+def plane_gradients(X: np.ndarray) -> np.ndarray:
+    """Gradients of the shape functions in each triangle's own plane, the first axis along its first edge, (n, 3, 2)."""
+    a, e = X[:, 1] - X[:, 0], X[:, 2] - X[:, 0]
+    length, twice = np.linalg.norm(a, axis=1), np.linalg.norm(np.cross(a, e), axis=1)
+    G = np.zeros((len(X), 3, 2))
+    G[:, 1, 0], G[:, 1, 1], G[:, 2, 1] = 1 / length, -(a * e).sum(1) / (length * twice), length / twice
+    G[:, 0] = -G[:, 1] - G[:, 2]
+    return G
+
+
 class SurfaceTriangle(ElementKind):
     """Linear triangles in space."""
 
