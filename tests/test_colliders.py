@@ -323,9 +323,9 @@ def test_nothing_to_ask(name):
     [
         (lambda: Plane((0, 0, 0), (0, 0, 0)), "Plane: the normal has no direction"),
         (lambda: Plane((0, np.nan, 0), (0, 1, 0)), "Plane: point: expected 3 finite numbers"),
-        (lambda: Plane((0, 0, 0), (0, 1, 0), -1.0), "Plane: size must be finite and positive, not -1.0"),
+        (lambda: Plane((0, 0, 0), (0, 1, 0), -1.0), "Plane: size must be positive and finite, not -1.0"),
         (lambda: Plane((0, 0, 0), (0, 1, 0), (1, 2, 3)), "size must be one or two numbers"),
-        (lambda: Sphere((0, 0, 0), 0.0, name="head"), "head: radius must be finite and positive, not 0"),
+        (lambda: Sphere((0, 0, 0), 0.0, name="head"), "head: radius must be positive and finite, not 0"),
         (lambda: Sphere((0, 0), 1.0), "Sphere: center: expected 3 finite numbers"),
         (lambda: Sphere((0, 0, 0), 1.0, thickness=-1e-3), "thickness must be finite and not negative, not -0.001"),
         (lambda: Sphere((0, 0, 0), 1.0, friction=np.inf), "friction must be finite and not negative, not inf"),

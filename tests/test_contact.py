@@ -235,8 +235,8 @@ def test_the_same_bits_for_any_number_of_threads(dtype):
 @pytest.mark.parametrize(
     ("rule", "said"),
     [
-        ({"k_n": 0.0}, "k_n must be positive"),
-        ({"radius": -1.0}, "radius must be positive"),
+        ({"k_n": 0.0}, "k_n must be positive and finite"),
+        ({"radius": -1.0}, "radius must be positive and finite"),
         ({"k_tau": -1.0}, "k_tau must be finite and not negative"),
         ({"rings": 0}, "rings must be a whole number"),
     ],

@@ -214,20 +214,27 @@ def test_selections_of_nothing_are_named():
 
 
 def test_overlapping_selections_are_named():
-    """Selections of moves are the same or have no vertex in common."""
+    """Selections of moves are the same or have no vertex in common; else the second is refused, and both are named."""
     scene, body = bar()
     scene.pin(body.where(x=0.0))
-    scene.move(body.where(y=0.0), pbng.Rotate("x", 1.0))
-    with pytest.raises(pbng.InputError, match="a selection of 15 vertices to move shares 3 with earlier pins or moves"):
-        scene.compile()
+    wanted = (
+        r"move of bar\.where\(y=0\.0\): 3 of its 15 vertices are also of the pin of bar\.where\(x=0\.0\), which has 9;"
+        " select the same vertices, none in common, or let one go before the other starts"
+    )
+    with pytest.raises(pbng.InputError, match=wanted):
+        scene.move(body.where(y=0.0), pbng.Rotate("x", 1.0))
+    assert scene.compile().fixed.sum() == 9  # what was refused has left no trace
 
 
 def test_selection_within_an_earlier_one_is_named():
     scene, body = bar()
-    scene.pin(body.where(x=0.0))
-    scene.move(body.where(x=0.0, y=0.0), pbng.Rotate("x", 1.0))
-    with pytest.raises(pbng.InputError, match="shares 3 with earlier"):
-        scene.compile()
+    scene.pin(body.where(x=0.0), until=2.0)
+    with pytest.raises(pbng.InputError, match="3 of its 3 vertices are also of the pin"):
+        scene.move(body.where(x=0.0, y=0.0), pbng.Rotate("x", 1.0), start=1.0)
+    other = scene.add(body.mesh, RUBBER, at=(0, 2, 0))
+    scene.pin(other.where(x=0.0))
+    with pytest.raises(pbng.InputError, match="9 of its 45 vertices are also of the pin"):
+        scene.pin(body.where())
 
 
 def test_nothing_prescribed_is_refused():
@@ -250,8 +257,8 @@ def test_loose_parts_are_warned_of(caplog):
         scene.compile()
     messages = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
     assert len(messages) == 2
-    assert messages[0].startswith("a part of body 'both' (27 vertices, among them 27) has no prescribed vertex")
-    assert messages[1].startswith("a part of body 'free' (27 vertices, among them 0) has no prescribed vertex")
+    assert messages[0].startswith("nothing holds a part of body 'both' (27 vertices, among them 27): it can move")
+    assert messages[1].startswith("nothing holds body 'free': it can move as a rigid body")
     caplog.clear()
     scene.pin(both.where(x=3.0))
     scene.pin(free.where(x=0.0))
@@ -342,3 +349,32 @@ def test_compiling_is_a_snapshot():
     assert problem.fixed.sum() == 9
     assert not problem.f_ext.any()
     assert scene.compile().fixed.sum() == 18
+
+
+@pytest.mark.parametrize(
+    ("rule", "said"),
+    [
+        *(({name: bad}, f"contact: {name} must be positive and finite, not {bad!r}")
+          for name in ("k_n", "radius") for bad in (0.0, -1.0, np.nan, np.inf, "x")),
+        *(({name: bad}, f"contact: {name} must be finite and not negative, not {bad!r}")
+          for name in ("k_tau", "thickness") for bad in (-1.0, np.nan, np.inf, "x")),
+        *(({"rings": bad}, f"contact: rings must be a whole number of at least 1, not {bad!r}")
+          for bad in (0, -1, 1.5, np.nan, "x", None)),
+        ({"self_collision": 3}, "contact: self_collision must be True, False or bodies, not 3"),
+        ({"self_collision": None}, "contact: self_collision must be True, False or bodies, not None"),
+        ({"self_collision": ["bar"]}, "contact: expected bodies, not str"),
+    ],
+)  # fmt: skip
+def test_bad_contact_is_named(rule, said):
+    scene, _ = bar()
+    with pytest.raises(pbng.InputError) as error:
+        scene.contact(**rule)
+    assert str(error.value) == said
+
+
+def test_one_body_may_collide_with_itself():
+    """``self_collision`` takes a body as well as several, and whole numbers of any kind do for ``rings``."""
+    scene, body = bar()
+    scene.contact(self_collision=body, rings=np.int64(3))
+    assert scene.compile(free=True).contact.surfaces.own.tolist() == [True]
+    assert scene.compile(free=True).contact.surfaces.rings == 3

@@ -9,11 +9,11 @@ from pbng.errors import InputError
 def checked_number(what: str, value: Any, positive: bool = True) -> float:
     """A finite number that is positive, or else not negative; InputError if it is not."""
     try:
-        number = float(value)
+        number = math.nan if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number) or number < 0 or (positive and number == 0):
-        raise InputError(f"{what} must be finite and {'positive' if positive else 'not negative'}, not {value!r}")
+        raise InputError(f"{what} must be {'positive and finite' if positive else 'finite and not negative'}, not {value!r}")
     return number
 
 

@@ -80,10 +80,11 @@ def solve(
         monitor: Called with a :class:`pbng.solvers.base.Progress` whenever the residual has been evaluated.
 
     Raises:
-        InputError: The scene or the start is not usable.
+        InputError: The scene or the start is not usable, or what holds the scene has let go by then.
     """
     problem = scene.compile() if isinstance(scene, Scene) else scene
     t = problem.end if at is None else at
+    _check_held("solve", problem, t, "give a time at= before that")
     problem = problem.at(t)
     x, budget = _start(problem, start), budget or Budget()
     method = (solver or default_solver(budget)).set_up(problem)
@@ -121,7 +122,8 @@ def simulate(
         velocity: At the start [m/s], (3,) for all vertices or (n_vert, 3); by default rest.
 
     Raises:
-        InputError: Something given cannot be used, or a free vertex has no mass where there is inertia.
+        InputError: Something given cannot be used, a free vertex has no mass where there is inertia, or without it what
+            holds the scene lets go before the last frame.
     """
     if frames < 1 or not (math.isfinite(fps) and fps > 0):
         raise InputError(f"simulate: frames must be at least 1 and fps positive, not {frames} and {fps}")
@@ -134,6 +136,7 @@ def simulate(
         steps = steps_of(fps, dt, substeps)
         moving = BackwardEuler(problem, solver, 1 / (fps * steps), x, velocities(problem, velocity))
         return _moving_frames(moving, steps, budget, frames, monitor)
+    _check_held("simulate", problem, (frames - 1) / fps, "take fewer frames, or inertia=True")
     return _frames(Equilibria(problem, solver, x), budget, frames, fps, monitor)
 
 
@@ -168,6 +171,16 @@ def _moving_frames(
         yield Frame(k, moving.t, result.x, result, moving.problem, moving.v, moving.report())
         if not result.status.ok:
             return  # the state is lost
+
+
+def _check_held(what: str, problem: Problem, t: float, way_out: str) -> None:
+    """InputError if until time t [s] all that holds the problem lets go."""
+    let_go = [since for since, phase in problem.phases() if since <= t and not phase.held]
+    if problem.held and let_go:  # who compiled a problem with free=True that nothing ever held has asked for it
+        raise InputError(
+            f"{what}: after t = {let_go[0]:g} s nothing holds scene {problem.name!r}: the equilibrium is not unique;"
+            f" {way_out}, or hold a part of each body"
+        )
 
 
 def _timed(method: Method, result: Result) -> Result:

@@ -1,7 +1,7 @@
 """The discrete problem: frozen arrays, and its energy and forces in float64 (Eqs. 11-17)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -114,6 +114,20 @@ class Problem:
     def at(self, t: float) -> "Problem":
         """The problem that holds at time t [s]."""
         return self if self.after is None or t < self.until else self.after.at(t)
+
+    def phases(self) -> Iterator[tuple[float, "Problem"]]:
+        """This problem and those that come after it, each with the time [s] from which it holds."""
+        since, phase = 0.0, self
+        while phase.after is not None:
+            yield since, phase
+            since, phase = phase.until, phase.after
+        yield since, phase
+
+    @property
+    def held(self) -> bool:
+        """Whether anything in space holds it: prescribed vertices, targets of weak constraints, or colliders."""
+        walls = self.contact is not None and bool(self.contact.colliders)
+        return walls or bool(self.fixed.any()) or any(w.anchored for w in self.weak)
 
     @property
     def n_vert(self) -> int:

@@ -2,15 +2,16 @@
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
 from pbng.bindings import Binding, bind, weak_constraints
 from pbng.bodies import Body, Points, Selection
-from pbng.checks import checked_vector
+from pbng.checks import checked_number, checked_vector
 from pbng.contact.collider import Collider
 from pbng.contact.surfaces import ContactRule, contact_spec, has_surface
 from pbng.elements.base import ElementKind
@@ -22,20 +23,10 @@ from pbng.materials.base import Material
 from pbng.materials.bending import Bending
 from pbng.mesh import Mesh, TetMesh, TriMesh, triangle_areas
 from pbng.motions import Motion, as_motion
+from pbng.prescribed import Move, Prescribed, check_clash, phases
 from pbng.problem import BodyRange, ElementGroup, Problem
 
 log = logging.getLogger("pbng")
-
-
-@dataclass(frozen=True, eq=False)
-class _Move:
-    """Prescribed vertices, by index in the scene, until a time; a pin has no motion."""
-
-    index: np.ndarray
-    motion: Motion | None
-    start: float
-    over: float
-    until: float = math.inf
 
 
 class Scene:
@@ -50,8 +41,8 @@ class Scene:
         self.name = name
         self.gravity = checked_vector("gravity", gravity)
         self.bodies: list[Body] = []
-        self._waits: list[float] = []  # of each body
-        self._moves: list[_Move] = []
+        self._moves: list[Move] = []
+        self._waits: list[Move] = []  # of bodies, as pins of the whole
         self._forces: list[tuple[np.ndarray, np.ndarray]] = []
         self._bindings: list[Binding] = []
         self._contact: ContactRule | None = None
@@ -75,11 +66,12 @@ class Scene:
             bending: How cloth resists bending; by default not at all.
             name: Unique; by default numbered.
             at: Translation [m] of the mesh, (3,).
-            wait: Time [s] until which all of it is held where it is, but for what moves.
+            wait: Time [s] until which all of it is held where it is: at rest, or where moves have left it.
 
         Raises:
             InputError: The name is taken, groups are unknown, overlap or leave cells out, triangles of a solid are not
-                plane, or cloth has an edge of more than two triangles or neighbours that are not oriented alike.
+                plane, cloth has an edge of more than two triangles or neighbours that are not oriented alike, or
+                ``wait`` is negative.
         """
         name = f"body{len(self.bodies)}" if name is None else name
         if name in (b.name for b in self.bodies):
@@ -89,24 +81,32 @@ class Scene:
         if at is not None:
             mesh = _translated(mesh, np.array(checked_vector(f"body {name!r}: at", at)))
         start = sum(b.mesh.n_vert for b in self.bodies)
-        if not (math.isfinite(wait) and wait >= 0):
-            raise InputError(f"body {name!r}: wait must be finite and not negative, not {wait}")
+        wait = checked_number(f"body {name!r}: wait", wait, positive=False)
         body = Body(name, mesh, _materials(name, mesh, material), start, bending)
         self.bodies.append(body)
-        self._waits.append(wait)
+        if wait > 0:
+            self._waits.append(Move(f"wait of body {name!r}", start + np.arange(mesh.n_vert), None, until=wait))
         return body
 
     def pin(self, selection: Selection, until: float = math.inf) -> None:
-        """Hold vertices where they are at rest, until a time [s] at which they are let go."""
-        _check_until("pin", until)
-        self._moves.append(_Move(self._checked("pin", selection), None, 0.0, 0.0, until))
+        """Hold vertices where they are at rest, or where moves take them.
+
+        Args:
+            selection: The vertices.
+            until: Time [s] at which they are let go, unless something else still holds them.
+
+        Raises:
+            InputError: As for :meth:`move`.
+        """
+        self._prescribe("pin", selection, None, until=until)
 
     def move(
         self, selection: Selection, motion: Any, over: float = 0.0, start: float = 0.0, until: float = math.inf
     ) -> None:
         """Prescribe the motion of vertices.
 
-        Moves of the same vertices follow upon each other: each starts from where the one before has left them.
+        Moves of the same vertices follow upon each other, in order of their start: each starts from where the ones
+        before have left them.
 
         Args:
             selection: The vertices.
@@ -114,14 +114,20 @@ class Scene:
                 selection's centroid unless they name a center.
             over: Seconds [s] in which it is carried out at a steady rate; 0 at once.
             start: Time [s] at which it begins; until then the vertices are held.
-            until: Time [s] at which the vertices are let go; by default they stay where the motion has ended.
+            until: Time [s] at which the motion stops and the vertices are let go, unless something else still holds
+                them; by default they stay where the motion has ended.
 
         Raises:
-            InputError: The selection is empty, or shares only some vertices with that of an earlier pin or move.
+            InputError: The selection is empty, ``until`` is not later than the start, or it has only some vertices in
+                common with another pin or move, and neither lets go before the other starts.
         """
-        _check_times("move", over, start)
-        _check_until("move", until)
-        self._moves.append(_Move(self._checked("move", selection), as_motion(motion), start, over, until))
+        self._prescribe("move", selection, as_motion(motion), over=over, start=start, until=until)
+
+    def _prescribe(self, what: str, selection: Selection, motion: Motion | None, **times: float) -> None:
+        index = self._checked(what, selection)
+        move = Move(f"{what} of {_words(selection)}", index, motion, **times)
+        check_clash(move, self._moves)
+        self._moves.append(move)
 
     def force(self, selection: Selection, force: Sequence[float]) -> None:
         """Spread a total force [N] evenly over vertices."""
@@ -136,7 +142,7 @@ class Scene:
         index = self._checked("traction", selection)
         mesh, start, faces = selection.body.mesh, selection.body.start, selection.faces
         if len(faces) == 0:
-            raise InputError(f"traction on {selection.words}: no whole face of the surface is selected")
+            raise InputError(f"traction on {_words(selection)}: no whole face of the surface is selected")
         if faces.shape[1] == 3:
             measure = np.linalg.norm(triangle_areas(mesh.X, faces), axis=1)
         else:
@@ -182,9 +188,8 @@ class Scene:
         elif isinstance(b, Selection | Points):
             self._checked_points("bind", b)
         elif isinstance(b, Motion) or callable(b):
-            _check_times("bind", over, start)
-            move, X = _Move(np.arange(len(points)), as_motion(b), start, over), points.X
-            other = _Prescribed(X, [move])
+            move = Move("bind", np.arange(len(points)), as_motion(b), start, over)
+            other = Prescribed(points.X, [move], np.ones(len(points), bool))
         binding = bind(points, other, k, k_n, k_tau, normal)
         weak_constraints([binding])  # says what is wrong with it here, and not when the scene compiles
         self._bindings.append(binding)
@@ -212,7 +217,7 @@ class Scene:
         k_tau: float = 0.0,
         radius: float | None = None,
         thickness: float | None = None,
-        self_collision: bool | Sequence[Body] = False,
+        self_collision: bool | Body | Sequence[Body] = False,
         rings: int = 2,
     ) -> None:
         """Let bodies, solids and cloth, collide with each other.
@@ -231,26 +236,29 @@ class Scene:
             rings: Rings of triangles around a vertex with which it does not collide.
 
         Raises:
-            InputError: It was called before, a number is negative or k_n zero, or a body belongs to another scene.
+            InputError: It was called before, a number is negative or not finite, k_n or the radius is zero, or a body
+                belongs to another scene.
         """
         if self._contact is not None:
             raise InputError("contact: called twice; one rule holds for the scene")
-        for name, value in (("k_n", k_n), ("radius", radius)):
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InputError(f"contact: {name} must be positive and finite, not {value}")
-        for name, value in (("k_tau", k_tau), ("thickness", thickness)):
-            if value is not None and not (math.isfinite(value) and value >= 0):
-                raise InputError(f"contact: {name} must be finite and not negative, not {value}")
-        if not (isinstance(rings, int) and rings >= 1):
-            raise InputError(f"contact: rings must be a whole number of at least 1, not {rings}")
-        own = self_collision if isinstance(self_collision, bool) else tuple(self_collision)
+        k_n = None if k_n is None else checked_number("contact: k_n", k_n)
+        radius = None if radius is None else checked_number("contact: radius", radius)
+        k_tau = checked_number("contact: k_tau", k_tau, positive=False)
+        if thickness is not None:
+            thickness = checked_number("contact: thickness", thickness, positive=False)
+        if not (isinstance(rings, Integral) and rings >= 1):
+            raise InputError(f"contact: rings must be a whole number of at least 1, not {rings!r}")
+        own: Any = (self_collision,) if isinstance(self_collision, Body) else self_collision
+        if not isinstance(own, bool | Iterable):
+            raise InputError(f"contact: self_collision must be True, False or bodies, not {own!r}")
+        own = own if isinstance(own, bool) else tuple(own)
         for b in (*bodies, *(own if isinstance(own, tuple) else ())):
             if not isinstance(b, Body):
                 raise InputError(f"contact: expected bodies, not {type(b).__name__}")
             self._check_body("contact", b)
             if not has_surface(b):
                 raise InputError(f"contact: body {b.name!r} has no surface: it is plane")
-        self._contact = ContactRule(bodies, own, k_n, k_tau, radius, thickness, rings)
+        self._contact = ContactRule(bodies, own, k_n, k_tau, radius, thickness, int(rings))
 
     def _checked_points(self, what: str, points: Any) -> Points:
         if isinstance(points, Points):
@@ -266,9 +274,7 @@ class Scene:
         if len(selection) == 0:
             low, high = selection.body.mesh.X.min(0), selection.body.mesh.X.max(0)
             spans = ", ".join(f"{a} in [{l:g}, {h:g}]" for a, l, h in zip("xyz", low, high))
-            raise InputError(
-                f"{what}: {selection.body.name}.where({selection.words}) selects no vertex; it has {spans}"
-            )
+            raise InputError(f"{what}: {_words(selection)} selects no vertex; it has {spans}")
         return selection.index
 
     def _check_body(self, what: str, body: Body) -> None:
@@ -278,8 +284,10 @@ class Scene:
     def compile(self, free: bool = False) -> Problem:
         """The discrete problem of this scene as it now stands; ``free`` allows that nothing holds a body.
 
+        Else a warning says which bodies, or parts of them, nothing holds, at first or after something was let go.
+
         Raises:
-            InputError: There is no body, nothing is held, or selections of moves overlap in part.
+            InputError: There is no body, or nothing is held at first.
         """
         if not self.bodies:
             raise InputError("the scene has no body")
@@ -303,101 +311,83 @@ class Scene:
             if isinstance(b.mesh, TriMesh) and not b.is_cloth:
                 f_ext[b.start : b.start + b.mesh.n_vert, 2] = 0  # plane strain: z never moves
         weak = weak_constraints(self._bindings)
-        phases = self._phases(X)
-        if not (free or self.colliders or phases[0][0].any() or any(w.anchored for w in weak)):
-            raise InputError("no vertex is pinned or moved: the equilibrium is not unique; pin a part of each body")
+        *earlier, (since, fixed, prescribed) = phases(X, [*self._moves, *self._waits])
         problem = Problem(
             name=self.name,
             X=X,
             groups=tuple(ElementGroup(kind, m, np.concatenate(cells)) for (kind, m), cells in groups.items()),
             bodies=tuple(BodyRange(b.name, b.start, b.start + b.mesh.n_vert, b.mesh) for b in self.bodies),
-            fixed=phases[-1][0],
-            prescribed=phases[-1][1],
+            fixed=fixed,
+            prescribed=prescribed,
             f_ext=f_ext,
             mass=mass,
             end=max(
                 [
-                    *(end for _, prescribed, until in phases for end in (prescribed.end, until) if end < math.inf),
+                    0.0,
+                    *(m.end for m in (*self._moves, *self._waits)),
                     *(c.end for c in self.colliders),
-                    *(b.targets.end for b in self._bindings if isinstance(b.targets, _Prescribed)),
+                    *(b.targets.end for b in self._bindings if isinstance(b.targets, Prescribed)),
                 ]
             ),
             weak=weak,
             contact=contact_spec(self.bodies, self._contact, self.colliders),
         )
-        for fixed, prescribed, until in phases[-2::-1]:
-            problem = replace(problem, fixed=fixed, prescribed=prescribed, until=until, after=problem)
+        for begins, fixed, prescribed in reversed(earlier):
+            problem = replace(problem, fixed=fixed, prescribed=prescribed, until=since, after=problem)
+            since = begins
         if not free:
-            self._warn_of_loose_parts(problem)
+            if not problem.held:
+                raise InputError("no vertex is pinned or moved: the equilibrium is not unique; pin a part of each body")
+            _warn_of_loose_parts(problem)
         return problem
 
-    def _phases(self, X: np.ndarray) -> list[tuple[np.ndarray, "_Prescribed", float]]:
-        """Which vertices are prescribed, where they are, and until when [s]: one after another."""
-        phases, t = [], 0.0
-        while t < math.inf:
-            moves = self._moves_at(t)
-            prescribed, fixed = _Prescribed(X, moves), np.zeros(len(X), bool)
-            fixed[prescribed.index] = True
-            t = min((m.until for m in moves), default=math.inf)
-            phases.append((fixed, prescribed, t))
-        return phases
 
-    def _moves_at(self, t: float) -> list[_Move]:
-        """The pins and moves that hold at time t [s], and pins of the rest of the bodies that wait."""
-        moves = [m for m in self._moves if m.until > t]
-        taken = np.concatenate([np.empty(0, int), *(m.index for m in moves)])
-        for body, wait in zip(self.bodies, self._waits):
-            index = np.setdiff1d(np.arange(body.start, body.start + body.mesh.n_vert), taken)
-            if wait > t and len(index):
-                moves.append(_Move(index, None, 0.0, 0.0, wait))
-        return moves
+def _warn_of_loose_parts(problem: Problem) -> None:
+    """Say what nothing holds, at first and whenever vertices are let go.
 
-    def _warn_of_loose_parts(self, problem: Problem) -> None:
-        held = np.zeros(problem.component.max() + 1, int)
-        anchors = [w.vertices.ravel() for w in problem.weak if w.anchored]
-        np.add.at(held, problem.component[np.concatenate([np.flatnonzero(problem.fixed), *anchors])], 1)
-        for label in np.flatnonzero(held == 0):
-            v = int(np.flatnonzero(problem.component == label)[0])
-            body = next(b for b in problem.bodies if b.start <= v < b.stop)
-            size = int((problem.component == label).sum())
+    Parts that may touch colliders or other parts are left out, for these may hold them; unless nothing is held at all.
+    """
+    part, contact = problem.component, problem.contact
+
+    def among(*vertices: np.ndarray) -> np.ndarray:
+        """Which parts (n_part,) some of these vertices belong to."""
+        found = np.zeros(part.max() + 1, bool)
+        for v in vertices:
+            found[part[v]] = True
+        return found
+
+    anchored = among(*(w.vertices.ravel() for w in problem.weak if w.anchored))
+    touching = among(contact.surface) if contact is not None else among()
+    if touching.sum() == 1 and contact is not None and not contact.colliders:
+        touching[:] = False  # it can touch itself alone
+    told = among()
+    for since, phase in problem.phases():
+        loose = ~(anchored | among(phase.fixed) | told)
+        if phase.held:
+            loose &= ~touching
+        for label in np.flatnonzero(loose):
             log.warning(
-                "a part of body %r (%d vertices, among them %d) has no prescribed vertex: it can move as a rigid body,"
-                " and under load it has no equilibrium",
-                body.name, size, v - body.start,
+                "%snothing holds %s: it can move as a rigid body, and under load it has no equilibrium",
+                f"after t = {since:g} s " if since > 0 else "", _named(problem, np.flatnonzero(part == label)),
             )  # fmt: skip
+        told |= loose
 
 
-class _Prescribed:
-    """Positions of the prescribed vertices as a function of time."""
+def _named(problem: Problem, vertices: np.ndarray) -> str:
+    """The bodies, or parts of bodies, that these vertices (k,) are."""
+    names = []
+    for body in problem.bodies:
+        mine = vertices[(vertices >= body.start) & (vertices < body.stop)]
+        if len(mine) == body.stop - body.start:
+            names.append(f"body {body.name!r}")
+        elif len(mine):
+            names.append(f"a part of body {body.name!r} ({len(mine)} vertices, among them {mine[0] - body.start})")
+    return " and ".join(names)
 
-    def __init__(self, X: np.ndarray, moves: list[_Move]) -> None:
-        self.sequences: list[tuple[np.ndarray, list[_Move]]] = []
-        owner = np.full(len(X), -1)
-        for move in moves:
-            owners = np.unique(owner[move.index])
-            if len(owners) == 1 and owners[0] >= 0 and len(self.sequences[owners[0]][0]) == len(move.index):
-                self.sequences[owners[0]][1].append(move)
-            elif len(owners) == 1 and owners[0] < 0:
-                owner[move.index] = len(self.sequences)
-                self.sequences.append((move.index, [move]))
-            else:
-                shared = int((owner[move.index] >= 0).sum())
-                raise InputError(
-                    f"a selection of {len(move.index)} vertices to move shares {shared} with earlier pins or moves;"
-                    " selections must be the same or have no vertex in common"
-                )
-        self.X = X
-        self.index = np.flatnonzero(owner >= 0)
-        self.end = max((max(m.start + m.over, m.motion.end if m.motion else 0.0) for m in moves), default=0.0)
 
-    def __call__(self, t: float) -> np.ndarray:
-        x = self.X.copy()
-        for index, moves in self.sequences:
-            for move in moves:
-                if move.motion is not None and t >= move.start:
-                    s = 1.0 if move.over == 0 else min((t - move.start) / move.over, 1.0)
-                    x[index] = move.motion.at(x[index], x[index].mean(0), s, t)
-        return x[self.index]
+def _words(selection: Selection) -> str:
+    """How a selection was made."""
+    return f"{selection.body.name}.where({selection.words})"
 
 
 def _materials(name: str, mesh: Mesh, material: Any) -> tuple[tuple[Material, np.ndarray], ...]:
@@ -430,13 +420,3 @@ def _materials(name: str, mesh: Mesh, material: Any) -> tuple[tuple[Material, np
 def _translated(mesh: Mesh, by: np.ndarray) -> Mesh:
     extra = {"skin": mesh.skin} if isinstance(mesh, TetMesh) else {}
     return type(mesh)(mesh.X + by, mesh.cells, groups=mesh.groups, cell_groups=mesh.cell_groups, **extra)
-
-
-def _check_times(what: str, over: float, start: float) -> None:
-    if not (math.isfinite(over) and over >= 0 and math.isfinite(start) and start >= 0):
-        raise InputError(f"{what}: over and start must be finite and not negative, not {over} and {start}")
-
-
-def _check_until(what: str, until: float) -> None:
-    if not until > 0:
-        raise InputError(f"{what}: until must be positive, not {until}")
