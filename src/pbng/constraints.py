@@ -90,14 +90,15 @@ class WeakEnergy:
     """
 
     def __init__(self, constraints: Sequence[WeakConstraints], n: int, slot: np.ndarray | None = None) -> None:
-        row, column, weight, first, anchored = [], [], [], 0, []
+        row, column, weight, first = [], [], [], 0
+        self.anchored: list[slice] = []  # which have targets, in the order of these
         for c in constraints:
             m, s = c.vertices.shape
             row.append(np.repeat(np.arange(first, first + m), s))
             column.append((c.vertices if slot is None else slot[c.vertices]).ravel())
             weight.append(c.weights.ravel())
             if c.anchored:
-                anchored.append(np.arange(first, first + m))
+                self.anchored.append(slice(first, first + m))
             first += m
         entries = np.concatenate(weight), (np.concatenate(row), np.concatenate(column))
         self.weights = scipy.sparse.csr_matrix(entries, (first, n))
@@ -105,12 +106,15 @@ class WeakEnergy:
         self.k = self.K[:, 0, 0].copy()
         same = (self.k[:, None, None] * np.eye(3) == self.K).all((1, 2))  # in all directions: a number will do
         self.directed = np.flatnonzero(~same)
-        self.anchored = np.concatenate(anchored) if anchored else np.empty(0, int)
 
     def gaps(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """C (m, 3) [m] at x (n, 3), with targets (n_target, 3)."""
         C = self.weights @ x
-        C[self.anchored] -= targets
+        used = 0
+        for which in self.anchored:
+            m = which.stop - which.start
+            C[which] -= targets[used : used + m]
+            used += m
         return C
 
     def ends(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -131,7 +135,8 @@ class WeakEnergy:
     def _pull(self, C: np.ndarray) -> np.ndarray:
         """K C (m, 3) [N]."""
         pull = self.k[:, None] * C
-        pull[self.directed] = np.einsum("mij,mj->mi", self.K[self.directed], C[self.directed])
+        if len(self.directed):
+            pull[self.directed] = np.einsum("mij,mj->mi", self.K[self.directed], C[self.directed])
         return pull
 
     @cached_property

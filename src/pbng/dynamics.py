@@ -123,5 +123,5 @@ class BackwardEuler:
         if self.toucher is None:
             return run(self.method, x, budget, monitor, targets=targets)
         contacts = self.toucher.find(self.x, x, max(self.t - self.dt, 0.0), self.t, dt=self.dt)
-        x, other = contacts.put_outside(x), contacts.parted(x, self.problem.fixed)
-        return run(self.method, x, budget, monitor, targets=targets, contacts=contacts, other=other)
+        x = self.toucher.start_of(contacts, x, targets)
+        return run(self.method, x, budget, monitor, targets=targets, contacts=contacts)

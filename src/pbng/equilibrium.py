@@ -85,6 +85,14 @@ class Toucher:
         self.seconds += time.perf_counter() - start
         return self.contacts
 
+    def start_of(self, contacts: Contacts, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """Where a step begins: at x (n_vert, 3), or with what overlaps there moved apart, if that has the lower energy."""
+        parted, x = contacts.parted(x, self.problem.fixed), contacts.put_outside(x)
+        if parted is None:
+            return x
+        self.method.start(x, targets, contacts)
+        return parted if self.method.lower(parted, x) else x
+
     def report(self, x: np.ndarray) -> ContactReport:
         """What touches at x (n_vert, 3), and what the frame took."""
         c = self.contacts

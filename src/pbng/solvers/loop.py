@@ -24,7 +24,6 @@ def run(
     contacts: Contacts | None = None,
     resume: bool = False,
     leave: Callable[[np.ndarray], bool] | None = None,
-    other: np.ndarray | None = None,
 ) -> Result:
     """Iterate from x (n_vert, 3), whose prescribed vertices are in place, until the budget says stop.
 
@@ -33,7 +32,7 @@ def run(
     ends the loop with the last state computed. ``targets`` are those of the problem's weak constraints (n_target, 3),
     ``contacts`` what touches during the solve. With ``resume`` x is where the last solve ended, and the method goes on
     in the precision that it had come to. Where ``leave`` says so of a monitored state the loop ends, as if the
-    iterations were used up. ``other`` (n_vert, 3) is a state to begin at instead if its energy is lower.
+    iterations were used up.
     """
     if budget.error is not None and not method.estimates_error:
         raise InputError(f"Budget(error={budget.error}): this method has no estimate of the error; use MultigridPBNG")
@@ -60,19 +59,10 @@ def run(
     status = _verdict(history, tolerance, floor, budget.error)
     iteration, correction = 0, 0.0
     seen = -1, x  # an iteration and the state after it
-    if status is None:
-
-        def begin(at: np.ndarray) -> None:
-            method.start(at, targets, contacts)
-            if refined:
-                method.refine()
-
-        if before is not None and (better := method.prepare(before, x)) is not None:
-            begin(contacts.put_outside(better) if contacts is not None else better)
-        if other is not None:
-            begin(other)
-            if not method.certify().energy < history.last.energy:
-                begin(x)
+    if status is None and before is not None and (better := method.prepare(before, x)) is not None:
+        method.start(contacts.put_outside(better) if contacts is not None else better, targets, contacts)
+        if refined:
+            method.refine()
     try:
         while status is None:
             if iteration >= budget.cap:

@@ -119,8 +119,7 @@ class TwoGrid(PackedMethod):
         with self.threads.used():
             extended = x + self.coarse.extend(increment)
             extended[fixed] = x[fixed]
-            lower = self.energy(self.pack(extended)) < self.energy(self.pack(x))
-        return extended if lower else None
+        return extended if self.lower(extended, x) else None
 
     def begin(self, x: np.ndarray) -> None:
         self.x = self.pack(x)

@@ -118,6 +118,11 @@ class PackedMethod:
     def prepare(self, before: np.ndarray, x: np.ndarray) -> np.ndarray | None:
         return None
 
+    def lower(self, y: np.ndarray, x: np.ndarray) -> bool:
+        """Whether the energy at y (n_vert, 3) is below that at x, with the targets and contacts of the last start."""
+        with self.threads.used():
+            return self.energy(self.pack(y)) < self.energy(self.pack(x))
+
     def start(
         self,
         x: np.ndarray,
