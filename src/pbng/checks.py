@@ -13,7 +13,8 @@ def checked_number(what: str, value: Any, positive: bool = True) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number) or number < 0 or (positive and number == 0):
-        raise InputError(f"{what} must be {'positive and finite' if positive else 'finite and not negative'}, not {value!r}")
+        wanted = "positive and finite" if positive else "finite and not negative"
+        raise InputError(f"{what} must be {wanted}, not {value!r}")
     return number
 
 

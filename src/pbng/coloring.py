@@ -123,21 +123,21 @@ def recolor(nodes, color, start, neighbour, stencils, among):
         for a in range(stencils.shape[1]):
             cell[position[stencils[c, a]]] = c
             position[stencils[c, a]] += 1
-    one = np.uint64(1)
+    # Who has last seen a colour taken. There is a free one below their number, and no colour is as high as this.
+    seen = np.full(color.max() + 2 + len(nodes), -1, np.int64)
     for v in nodes:
-        taken = np.uint64(0)
         for k in range(start[v], start[v + 1]):
             u = neighbour[k]
             if among[u]:
-                taken |= one << np.uint64(color[u])
+                seen[color[u]] = v
         for k in range(first[v], first[v + 1]):
             for a in range(stencils.shape[1]):
                 u = stencils[cell[k], a]
                 if among[u] and u != v:
-                    taken |= one << np.uint64(color[u])
-        if (taken >> np.uint64(color[v])) & one:
+                    seen[color[u]] = v
+        if seen[color[v]] == v:
             c = 0
-            while c < 63 and (taken >> np.uint64(c)) & one:
+            while seen[c] == v:
                 c += 1
             color[v] = c
 

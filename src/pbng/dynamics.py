@@ -63,6 +63,7 @@ class BackwardEuler:
 
     def __init__(self, problem: Problem, solver: Solver, dt: float, x: np.ndarray, v: np.ndarray) -> None:
         self.solver, self.dt, self.step_number = solver, dt, 0
+        self.toucher: Toucher | None = None
         self._take(problem)
         self.x, self.v = problem.constrain(x, 0.0), v
         held = problem.fixed
@@ -73,28 +74,29 @@ class BackwardEuler:
     def _take(self, problem: Problem) -> None:
         self.problem, self.free = problem, np.flatnonzero(~problem.fixed)
         self.method = self.solver.set_up(problem.dynamic(self.dt))
-        self.toucher = Toucher(problem, self.method) if problem.contact else None
+        self.toucher = Toucher(problem, self.method, self.toucher) if problem.contact else None
 
     @property
     def t(self) -> float:
         return self.step_number * self.dt
 
     def look(self) -> Result:
-        """The certificate of the state as it is."""
-        return self._run(self.x, self.x, Budget(iterations=0), None)
+        """The certificate of the state as it is, once it is outside of the colliders."""
+        result = self._run(self.x, self.x, self.t, Budget(iterations=0), None)
+        if self.toucher:
+            self.x = self.toucher.contacts.put_outside(self.x)
+        return result
 
     def step(self, budget: Budget, monitor: Monitor | None = None) -> Result:
         """Take one step; a result that is not finite or was interrupted leaves the state as it was."""
         if (problem := self.problem.at(self.t + 1e-6 * self.dt)) is not self.problem:
             self._take(problem)
-        ahead = self.x + self.dt * self.v
-        self.step_number += 1
-        result = self._run(self.problem.constrain(ahead, self.t), ahead, budget, monitor)
+        ahead, t = self.x + self.dt * self.v, (self.step_number + 1) * self.dt
+        result = self._run(self.problem.constrain(ahead, t), ahead, t, budget, monitor)
         if result.status.ok:
             x = np.asarray(result.x, float)
             self.v, self.x = (x - self.x) / self.dt, x
-        else:
-            self.step_number -= 1
+            self.step_number += 1
         return result
 
     def advance(self, steps: int, budget: Budget, monitor: Monitor | None = None) -> Result:
@@ -118,10 +120,11 @@ class BackwardEuler:
         """What touched in the steps since the last :meth:`advance` began."""
         return self.toucher.report(self.x) if self.toucher else None
 
-    def _run(self, x: np.ndarray, ahead: np.ndarray, budget: Budget, monitor: Monitor | None) -> Result:
-        targets = np.concatenate([self.problem.targets(self.t), ahead[self.free]])
+    def _run(self, x: np.ndarray, ahead: np.ndarray, t: float, budget: Budget, monitor: Monitor | None) -> Result:
+        """Solve for x (n_vert, 3) at time t [s], beginning there, with inertia that draws to ``ahead``."""
+        targets = np.concatenate([self.problem.targets(t), ahead[self.free]])
         if self.toucher is None:
             return run(self.method, x, budget, monitor, targets=targets)
-        contacts = self.toucher.find(self.x, x, max(self.t - self.dt, 0.0), self.t, dt=self.dt)
-        x = self.toucher.start_of(contacts, x, targets)
+        contacts = self.toucher.find(self.x, x, max(t - self.dt, 0.0), t, dt=self.dt)
+        x = self.toucher.start_of(contacts, x, targets) if budget.cap else contacts.put_outside(x)
         return run(self.method, x, budget, monitor, targets=targets, contacts=contacts)

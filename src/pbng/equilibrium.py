@@ -56,9 +56,10 @@ class Toucher:
     Args:
         problem: A problem with contact.
         method: What solves it.
+        before: Who did so until now, and knows what colliders bear.
     """
 
-    def __init__(self, problem: Problem, method: Method) -> None:
+    def __init__(self, problem: Problem, method: Method, before: "Toucher | None" = None) -> None:
         assert problem.contact is not None
         if not isinstance(method, PackedMethod):
             raise InputError(f"scene {problem.name!r}: contact needs PBNG or MultigridPBNG")
@@ -67,6 +68,7 @@ class Toucher:
         self.contacts = Contacts()
         self.size = float(np.linalg.norm(np.ptp(problem.X, axis=0)))
         self.checked = False
+        self.inherited = before.method.borne() if before is not None else None
         self.began()
 
     def began(self) -> None:
@@ -77,16 +79,18 @@ class Toucher:
     def find(self, x0: np.ndarray, x1: np.ndarray, t0: float, t1: float, **options: Any) -> Contacts:
         """As :meth:`pbng.contact.detection.Detector.find`, timed."""
         start = time.perf_counter()
-        if not self.checked:
-            self.detector.check(x0)
-            self.checked = True
-        self.detector.borne = self.method.borne()
-        self.contacts = self.detector.find(x0, x1, t0, t1, **options)
+        with self.method.threads.used():
+            if not self.checked:
+                self.detector.check(x0, t0)
+                self.checked = True
+            self.detector.borne = self.method.borne() if self.inherited is None else self.inherited
+            self.inherited = None
+            self.contacts = self.detector.find(x0, x1, t0, t1, **options)
         self.seconds += time.perf_counter() - start
         return self.contacts
 
     def start_of(self, contacts: Contacts, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """Where a step begins: at x (n_vert, 3), or with what overlaps there moved apart, if that has the lower energy."""
+        """Where a step begins: at x (n_vert, 3), or with what overlaps there moved apart, if that has less energy."""
         parted, x = contacts.parted(x, self.problem.fixed), contacts.put_outside(x)
         if parted is None:
             return x
@@ -134,11 +138,12 @@ class Equilibria:
 
     def __init__(self, problem: Problem, solver: Solver, x: np.ndarray) -> None:
         self.solver, self.x, self.t = solver, x, 0.0
+        self.toucher: Toucher | None = None
         self._take(problem)
 
     def _take(self, problem: Problem) -> None:
         self.problem, self.method = problem, self.solver.set_up(problem)
-        self.toucher = Toucher(problem, self.method) if problem.contact else None
+        self.toucher = Toucher(problem, self.method, self.toucher) if problem.contact else None
 
     def at(self, t: float, budget: Budget, monitor: Monitor | None) -> tuple[Result, ContactReport | None]:
         """The equilibrium at time t [s], and what touches there."""
@@ -184,7 +189,8 @@ def equilibrium(
         def leave(x: np.ndarray, begun: np.ndarray = begun) -> bool:
             return _most(begun, x) > far
 
-        result = run(method, state, left, monitor, before, targets, contacts, bool(results), leave)
+        told = monitor and results and _continued(monitor, results)
+        result = run(method, state, left, told or monitor, before, targets, contacts, bool(results), leave)
         results.append(result)
         left = _left(budget, results)
         settled = result.iterations == 0 and result.status is not Status.ITERATIONS
@@ -204,6 +210,12 @@ def equilibrium(
     else:
         results[-1] = replace(results[-1], status=Status.CONTACTS)
     return joined(results, moved)
+
+
+def _continued(monitor: Monitor, results: list[Result]) -> Monitor:
+    """Tells a monitor of one round as of a part of the whole solve."""
+    done, first, seconds = sum(r.iterations for r in results), results[0].residuals[0], sum(r.seconds for r in results)
+    return lambda p: monitor(replace(p, iteration=done + p.iteration, first=first, seconds=seconds + p.seconds))
 
 
 def _stagnates(first: list[float]) -> bool:
@@ -247,6 +259,7 @@ def joined(results: list[Result], moved: list[float]) -> Result:
         residuals=np.concatenate([r.residuals for r in results]),
         energies=np.concatenate([r.energies for r in results]),
         monitored=np.concatenate([r.monitored + d for r, d in zip(results, done)]),
+        correction=next((r.correction for r in reversed(results) if r.iterations), 0.0),
         seconds=sum(r.seconds for r in results),
         monitor_seconds=sum(r.monitor_seconds for r in results),
     )

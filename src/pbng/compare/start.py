@@ -5,9 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pbng.contact.contacts import ContactEnergy, Contacts
 from pbng.errors import InputError
+from pbng.packing import origin_of
 from pbng.problem import Problem
 from pbng.solvers.base import Method
+
+TOUCHED = 4.0  # roundings of float32 that a vertex may be off a half-space and touch it
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,19 +23,24 @@ class Start:
         x: The same with these in their places.
         targets: Points in space that weak constraints end at [m], (n_target, 3).
         at: Time [s] at which motions are taken.
+        contacts: What touches, found beforehand for all of them (:func:`pbng.compare.reference.touching`), or None.
     """
 
     before: np.ndarray
     x: np.ndarray
     targets: np.ndarray
     at: float
+    contacts: Contacts | None = None
 
     @classmethod
     def of(cls, problem: Problem, start: np.ndarray | None = None, at: float | None = None) -> "Start":
         """From rest, or ``start`` (n_vert, 3) [m], to the time ``at`` [s], by default when every motion has ended.
 
+        What is let go before that time is free: the start is that of ``problem.at(at)``.
+
         Raises:
-            InputError: The positions have another shape or are not finite, or the problem is a step of backward Euler.
+            InputError: The positions have another shape or are not finite, nothing holds the problem any longer, or it
+                is a step of backward Euler.
         """
         if problem.dt is not None:
             raise InputError(
@@ -45,14 +54,21 @@ class Start:
         time = problem.end if at is None else float(at)
         if not np.isfinite(time):
             raise InputError(f"at must be finite, not {at}")
+        if problem.held and not problem.at(time).held:
+            raise InputError(
+                f"at t = {time:g} s nothing holds scene {problem.name!r} any longer: the equilibrium is not unique;"
+                " give a time at= before that"
+            )
+        problem = problem.at(time)
         return cls(before, problem.constrain(before, time), problem.targets(time), time)
 
     def begin(self, method: Method) -> None:
         """Hand the start to a method, which may make a better one of it, as in a solve."""
-        method.start(self.x, self.targets)
+        method.start(self.x, self.targets, self.contacts)
         better = method.prepare(self.before, self.x)
         if better is not None:
-            method.start(better, self.targets)
+            better = better if self.contacts is None else self.contacts.put_outside(better)
+            method.start(better, self.targets, self.contacts)
 
 
 class Seen(NamedTuple):
@@ -69,21 +85,28 @@ class Judge:
 
     Args:
         problem: What is solved.
-        targets: As of :class:`Start`.
+        start: Where all begin: with the targets of weak constraints, and what touches.
         reference: The equilibrium (n_vert, 3) [m] that errors are distances from, or None.
     """
 
-    def __init__(self, problem: Problem, targets: np.ndarray, reference: np.ndarray | None = None) -> None:
-        self.problem, self.targets, self.reference = problem, targets, reference
-        self.free = ~problem.fixed
+    def __init__(self, problem: Problem, start: Start, reference: np.ndarray | None = None) -> None:
+        self.problem, self.targets, self.reference = problem, start.targets, reference
+        self.free, n = ~problem.fixed, problem.n_vert
+        self.origin = origin_of(problem.X)
+        self.touching = ContactEnergy(start.contacts, n, np.arange(n), self.origin) if start.contacts else None
 
     def look(self, x: np.ndarray) -> Seen:
         """The state x (n_vert, 3) [m]."""
         x = np.asarray(x, float)
         with np.errstate(all="ignore"):
             forces, _, inverted = self.problem.evaluate(x, self.targets)
-            residual = float(np.linalg.norm((forces + self.problem.f_ext)[self.free]))
-            return Seen(residual, self.problem.energy(x, self.targets), distance(x, self.reference), inverted)
+            f, energy = forces + self.problem.f_ext, self.problem.energy(x, self.targets)
+            if self.touching:
+                near = x - self.origin
+                f += self.touching.forces(near)[0]
+                self.touching.balance(f, near, TOUCHED * 0.5 * float(np.finfo(np.float32).eps * np.abs(near).max()))
+                energy += self.touching.energy(near)
+            return Seen(float(np.linalg.norm(f[self.free])), energy, distance(x, self.reference), inverted)
 
 
 def distance(x: np.ndarray, y: np.ndarray | None) -> float:

@@ -2,13 +2,14 @@
 
 A *contact* is a weak constraint between two interpolated points, one-sided: with C = Σ_j w_j x_j, weights of one side
 positive and of the other negative, and the gap g = n·C - offset, its energy is ½ k_n min(g, 0)². If it resisted when it
-was found it has ½ k_tau |C - n n·C|² too, for as long as it stands. A *half-space* is where one vertex has to stay: n·x
->= offset, exactly.
+was found it has ½ k_tau |(I - n nᵀ)(C - C₀)|² too, C₀ being what C was then, for as long as it stands. A *half-space*
+is where one vertex has to stay: n·x >= offset, exactly.
 
 Stencils, normals and offsets are those of the start of the step: energies are convex in what a node sees of them.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -16,8 +17,9 @@ import scipy.sparse
 from pbng.constraints import stencil_hessian
 
 CORNERS = 4  # vertices of a stencil: a vertex and a triangle, or two edges
+NEVER = -1e30  # offset [m] of a contact that does not resist
 PARTINGS = 4  # rounds in which what overlaps is moved apart
-ROUNDS = 8  # of projections onto the half-spaces of one vertex
+ROUNDS = 64  # of projections onto the half-spaces of one vertex, at most
 
 
 def _none(*shape: int, dtype: type = float) -> np.ndarray:
@@ -35,6 +37,7 @@ class Contacts:
         offset: What n·C must not be less than [m], (m,).
         k_n: Stiffness [N/m], (m,).
         k_tau: Tangential stiffness [N/m], (m,); zero where nothing resisted yet.
+        start: C₀ [m], (m, 3).
         kept: Distance that is to be kept [m], (m,): the offset, unless that gives way for now.
         vertex: Vertex of each half-space, (k,) int32.
         plane: Its normal, (k, 3).
@@ -50,6 +53,7 @@ class Contacts:
     offset: np.ndarray = field(default_factory=_none)
     k_n: np.ndarray = field(default_factory=_none)
     k_tau: np.ndarray = field(default_factory=_none)
+    start: np.ndarray = field(default_factory=lambda: _none(3))
     kept: np.ndarray = field(default_factory=_none)
     vertex: np.ndarray = field(default_factory=lambda: _none(dtype=np.int32))
     plane: np.ndarray = field(default_factory=lambda: _none(3))
@@ -61,6 +65,20 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.vertices) + len(self.vertex)
 
+    def ties(self) -> "Contacts":
+        """What remains of contacts once others are found in their place: their tangential springs."""
+        k = np.flatnonzero(self.k_tau > 0)
+        open_ = np.full(len(k), NEVER)
+        return Contacts(
+            self.vertices[k], self.weights[k], self.normal[k], open_, self.k_n[k], self.k_tau[k], self.start[k], open_
+        )
+
+    def plus(self, other: "Contacts") -> "Contacts":
+        """These and the contacts between surfaces of another."""
+        names = ("vertices", "weights", "normal", "offset", "k_n", "k_tau", "start", "kept")
+        joined: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
+        return replace(self, **joined)
+
     def clearance(self, x: np.ndarray) -> np.ndarray:
         """How much farther apart each contact is at x (n_vert, 3) than it is to be kept [m], (m,)."""
         C = np.einsum("mj,mji->mi", self.weights, x[self.vertices])
@@ -69,7 +87,8 @@ class Contacts:
     def put_outside(self, x: np.ndarray) -> np.ndarray:
         """A copy of x (n_vert, 3) with every vertex in its half-spaces."""
         x = np.array(x, float)
-        return _moved_in(x, self.vertex, self.plane, self.level)
+        move_in(x, self.vertex, self.plane, self.level)
+        return x
 
     def parted(self, x: np.ndarray, fixed: np.ndarray) -> np.ndarray | None:
         """A copy of x (n_vert, 3) in its half-spaces and with less overlap: a state to begin at. None if none resists.
@@ -93,7 +112,8 @@ class Contacts:
             np.add.at(moved, self.vertices[c], push)
             np.add.at(count, self.vertices[c], w[c] != 0)
             x += moved / np.maximum(count, 1)[:, None]
-        return None if none else _moved_in(x, self.vertex, self.plane, self.level)
+        move_in(x, self.vertex, self.plane, self.level)
+        return None if none else x
 
 
 class ContactEnergy:
@@ -113,7 +133,7 @@ class ContactEnergy:
         self.weights = scipy.sparse.csr_matrix(entries, (m, n))
         self.spread = self.weights.T.tocsr()
         self.reach = np.sqrt((c.weights**2).sum(1))  # norm of each contact's weights
-        self.normal, self.offset, self.k_n, self.k_tau = c.normal, c.offset, c.k_n, c.k_tau
+        self.normal, self.offset, self.k_n, self.k_tau, self.start = c.normal, c.offset, c.k_n, c.k_tau, c.start
         self.sticks = bool(c.k_tau.any())
         self.vertex, self.plane = slot[c.vertex], c.plane
         self.level = c.level - c.plane @ origin
@@ -125,7 +145,7 @@ class ContactEnergy:
         C, depth = self._gaps(x)
         energy = 0.5 * float((self.k_n * depth * depth).sum())
         if self.sticks:
-            energy += 0.5 * float((self.k_tau * (self._across(C) ** 2).sum(1)).sum())
+            energy += 0.5 * float((self.k_tau * (self._slipped(C) ** 2).sum(1)).sum())
         if self.rubs:
             energy += float((self.friction * (self._slid(x)[1] - self.creep)).sum())
         return energy
@@ -135,7 +155,7 @@ class ContactEnergy:
         C, depth = self._gaps(x)
         pull = (self.k_n * depth)[:, None] * self.normal
         if self.sticks:
-            pull += self.k_tau[:, None] * self._across(C)
+            pull += self.k_tau[:, None] * self._slipped(C)
         f, scale = -(self.spread @ pull), float((np.linalg.norm(pull, axis=1) * self.reach).sum())
         if self.rubs:
             u, length = self._slid(x)
@@ -144,25 +164,21 @@ class ContactEnergy:
             scale += float(np.linalg.norm(rub, axis=1).sum())
         return f, scale
 
-    def borne(self, f: np.ndarray) -> np.ndarray:
-        """With what force [N] each half-space bears its vertex against forces f (n, 3), (k,)."""
-        return np.maximum(-(self.plane * f[self.vertex]).sum(1), 0.0)
-
-    def balanced(self, f: np.ndarray, x: np.ndarray, tolerance: float) -> None:
-        """Take from forces f (n, 3) at x (n, 3), in place, what half-spaces that are touched bear."""
-        if len(self.vertex) == 0:
-            return
-        touched = self.held(x, tolerance)
-        vertex, plane = self.vertex[touched], self.plane[touched]
+    def balance(self, f: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
+        """Take from forces f (n, 3) at x (n, 3), in place, what half-spaces that are touched bear, (k,) [N]."""
+        borne, touched = np.zeros(len(self.vertex)), np.flatnonzero(self.held(x, tolerance))
         # What is left is the part of a force along which its vertex could move: its projection onto a cone.
-        f[:] = _moved_in(f, vertex, plane, np.zeros(len(vertex)))
+        borne[touched] = move_in(f, self.vertex[touched], self.plane[touched], np.zeros(len(touched)))
+        return borne
 
     def put_outside(self, x: np.ndarray, held: np.ndarray | None = None) -> None:
         """Move x (n, 3), of any precision, into the half-spaces, in place; onto the planes of those ``held`` (k,)."""
         if len(self.vertex):
             which = np.unique(self.vertex)
             local = np.searchsorted(which, self.vertex)
-            x[which] = _moved_in(np.array(x[which], float), local, self.plane, self.level, held)
+            moved = np.array(x[which], float)
+            move_in(moved, local, self.plane, self.level, held)
+            x[which] = moved
 
     def held(self, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Which half-spaces are touched at x to within a tolerance [m], (k,) bool."""
@@ -223,30 +239,40 @@ class ContactEnergy:
         u = u - (self.plane * u).sum(1)[:, None] * self.plane
         return u, np.sqrt((u * u).sum(1) + self.creep**2)
 
-    def _across(self, C: np.ndarray) -> np.ndarray:
-        return C - (self.normal * C).sum(1)[:, None] * self.normal
+    def _slipped(self, C: np.ndarray) -> np.ndarray:
+        u = C - self.start
+        return u - (self.normal * u).sum(1)[:, None] * self.normal
 
 
-def _moved_in(
+def move_in(
     x: np.ndarray, vertex: np.ndarray, plane: np.ndarray, level: np.ndarray, held: np.ndarray | None = None
 ) -> np.ndarray:
-    """x (n, 3) with each vertex moved to the nearest point of its half-spaces (Dykstra's projections), in place.
+    """Move each vertex to the nearest point of its half-spaces, in place (Dykstra's projections).
 
-    Of those ``held`` it is moved onto the plane. One half-space a vertex takes one round; the last ends in it.
+    Args:
+        x: Positions (n, 3), float64.
+        vertex, plane, level: The half-spaces, as of :class:`Contacts`, (k,), (k, 3), (k,).
+        held: Of which of them (k,) the vertex is moved onto the plane, whichever side it is on.
+
+    Returns:
+        How far each half-space has pushed its vertex, (k,): x is what it was plus Σ pushed n.
     """
-    if len(vertex) == 0:
-        return x
+    pushed = np.zeros(len(vertex))
     least = np.zeros(len(vertex)) if held is None else np.where(held, -np.inf, 0.0)
     order = np.argsort(vertex, kind="stable")
     turn = np.empty(len(vertex), np.int64)  # half-spaces of one vertex take turns
-    start = np.searchsorted(vertex[order], vertex[order])
-    turn[order] = np.arange(len(vertex)) - start
-    turns = [np.flatnonzero(turn == t) for t in range(turn.max() + 1)]
-    pushed = np.zeros(len(vertex))
-    for _ in range(ROUNDS if len(turns) > 1 else 1):
-        for mine in turns:
+    turn[order] = np.arange(len(vertex)) - np.searchsorted(vertex[order], vertex[order])
+    several = np.isin(vertex, vertex[turn > 0])  # one alone is done at once
+    for number in range(ROUNDS):
+        change = 0.0
+        for t in range(int(turn.max(initial=-1)) + 1):
+            mine = np.flatnonzero((turn == t) & several) if number else np.flatnonzero(turn == t)
             v, n = vertex[mine], plane[mine]
             now = np.maximum(level[mine] - (n * x[v]).sum(1) + pushed[mine], least[mine])
-            x[v] += (now - pushed[mine])[:, None] * n
+            step = now - pushed[mine]
+            x[v] += step[:, None] * n
             pushed[mine] = now
-    return x
+            change = max(change, float(np.abs(step).max(initial=0.0)))
+        if not several.any() or change <= 1e-9 * float(np.abs(pushed).max()):
+            break
+    return pushed

@@ -1,14 +1,14 @@
 """Everything that may touch in a step: surfaces each other, and colliders."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
 from pbng.contact.collider import Touches
-from pbng.contact.contacts import Contacts
+from pbng.contact.contacts import Contacts, move_in
 from pbng.contact.pairs import SurfaceDetector
 from pbng.contact.spec import CLOSE, NEAR, ContactSpec
+from pbng.errors import InputError
 
 CREEP = 1e-3  # of the margin: ways shorter than this do not count as sliding
 
@@ -26,14 +26,23 @@ class Detector:
         self.spec = spec
         self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
         self.free = spec.surface[~fixed[spec.surface]]
-        self.reach = self.surfaces.radius if self.surfaces else math.inf  # farther off, directions are of no use [m]
+        self.reach = self.surfaces.radius if self.surfaces else spec.margin  # farther off, directions are of no use [m]
+        self.ties = Contacts()  # between surfaces, since the last step began
         self.since: tuple[np.ndarray, float] | None = None  # where the last step began, and when [s]
         self.borne = np.zeros((len(X), 3))  # with what force [N] colliders bear each vertex
 
-    def check(self, x: np.ndarray) -> None:
-        """As :meth:`pbng.contact.pairs.SurfaceDetector.check`."""
+    def check(self, x: np.ndarray, t: float) -> None:
+        """InputError if a body lies wholly inside another, or inside a collider at time t [s], at x (n_vert, 3)."""
         if self.surfaces:
             self.surfaces.check(x)
+        for name, start, stop in self.spec.bodies:
+            mine = self.free[np.searchsorted(self.free, start) : np.searchsorted(self.free, stop)]
+            for c in self.spec.colliders if len(mine) else ():
+                d = c.distance(x[mine], t)[0]
+                if d.max() < 0 and d.min() < -self.spec.margin:
+                    raise InputError(
+                        f"contact: body {name!r} starts fully inside collider {c.label!r}; move one of them"
+                    )
 
     def find(
         self,
@@ -51,9 +60,10 @@ class Detector:
         is how far from x1 vertices may come to lie. With t0 = t1 the step goes on in which contacts were sought last:
         friction counts from where that began.
         """
-        if t0 < t1 or self.since is None:
+        begins = t0 < t1 or self.since is None
+        if begins:
             self.since = x0, t0
-        found = self.surfaces.find(x0, x1, dt, ahead, hold) if self.surfaces else Contacts()
+        found = self._between_surfaces(x0, x1, dt, ahead, hold, begins) if self.surfaces else Contacts()
         before, after, near = x0[self.free], x1[self.free], np.asarray(self.spec.margin + ahead)
         if dt is not None:
             near = CLOSE / NEAR * self.spec.margin + np.linalg.norm(after - before, axis=1)
@@ -61,21 +71,56 @@ class Detector:
         if touches:
             normal = np.concatenate([t.normal for t in touches])
             vertex = self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32)
+            level = (normal * np.concatenate([t.point for t in touches])).sum(1)
+            normal, level = self._cut(x0, vertex, normal, level)
             found = replace(
                 found,
                 vertex=vertex,
                 plane=normal,
-                level=(normal * np.concatenate([t.point for t in touches])).sum(1),
+                level=level,
                 friction=self._friction(touches, vertex, normal),
                 anchor=self._anchors(touches, vertex, t1),
                 creep=CREEP * self.spec.margin,
             )
         return found
 
+    def _between_surfaces(
+        self, x0: np.ndarray, x1: np.ndarray, dt: float | None, ahead: float, hold: float, begins: bool
+    ) -> Contacts:
+        """Contacts between surfaces. What the rule of the scene makes stick does so from where a step began."""
+        assert self.surfaces is not None
+        k_tau = self.surfaces.surfaces.k_tau
+        if dt is not None or k_tau == 0:
+            return self.surfaces.find(x0, x1, dt, ahead, hold, k_tau)
+        if begins:
+            found = self.surfaces.find(x0, x1, dt, ahead, 0.0, k_tau)
+            self.ties = found.ties()
+            return found
+        return self.surfaces.find(x0, x1, dt, ahead, hold, 0.0).plus(self.ties)
+
     def _friction(self, touches: list[Touches], vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """What friction may bear of each half-space [N]: its coefficient times what was last borne along the normal."""
         coefficient = np.repeat([c.friction for c in self.spec.colliders], [len(t.vertex) for t in touches])
-        return coefficient * np.maximum((self.borne[vertex] * normal).sum(1), 0.0)
+        if not coefficient.any():
+            return coefficient
+        which, local = np.unique(vertex, return_inverse=True)
+        return coefficient * move_in(-self.borne[which], local, normal, np.zeros(len(local)))
+
+    def _cut(
+        self, x: np.ndarray, vertex: np.ndarray, normal: np.ndarray, level: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Half-spaces as vertices of plane bodies see them: cut by their plane, in which they stay."""
+        flat = np.flatnonzero(np.isin(vertex, self.spec.plane))
+        if len(flat):
+            level[flat] -= normal[flat, 2] * x[vertex[flat], 2]
+            normal[flat, 2] = 0.0
+            length = np.linalg.norm(normal[flat], axis=1)
+            length[length == 0] = 1.0  # it is parallel to the plane, and nothing can be done
+            normal[flat] /= length[:, None]
+            level[flat] /= length
+            aside = flat[(normal[flat] == 0).all(1)]
+            level[aside] = -np.inf
+        return normal, level
 
     def _anchors(self, touches: list[Touches], vertex: np.ndarray, t: float) -> np.ndarray:
         """Where vertices would be at time t had they stuck to the colliders since the step began, (k, 3) [m]."""

@@ -35,8 +35,8 @@ from pbng.sweep import aligned_part
 
 HELD = 1e30  # diagonal of the Hessian of a node that is swept elsewhere: it does not move
 ROUNDS = 8  # of multipliers of a node with several contacts
-# Numbers of an incidence: own weight, sum of all, 3 others, normal, offset, compliance, tangential stiffness; friction
-# and its anchor.
+# Numbers of an incidence: own weight, sum of all, 3 others, normal, offset, compliance, tangential stiffness, friction,
+# and what slips from where: C₀, or the anchor.
 ROW = 15
 _1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(1, 12))
 
@@ -54,6 +54,7 @@ class ContactNodes:
         self.problem, self.packed = problem, packed
         self.neighbours = _neighbours(problem, problem.contact.surface)
         self.color = problem.color.copy()  # of the last step, for nodes that were in contact then
+        self.contacts: Contacts | None = None  # of this step
         self.node = np.empty(0, np.int64)  # in contact, in order of the problem
         self.recolored = self.repacked = 0  # nodes so far, and how long it took [s]
         self.seconds = 0.0
@@ -62,6 +63,7 @@ class ContactNodes:
 
     def update(self, contacts: Contacts) -> None:
         """Take the contacts of a new step."""
+        self.contacts = contacts
         start = time.perf_counter() - compile_seconds()
         problem = self.problem
         found = np.zeros(problem.n_vert, bool)
@@ -121,6 +123,7 @@ class ContactNodes:
         row[:n, 8] = c.offset[contact]
         row[:n, 9] = 1 / c.k_n[contact]
         row[:n, 10] = c.k_tau[contact]
+        row[:n, 12:] = c.start[contact]
         row[n:, 0] = row[n:, 1] = 1
         row[n:, 5:8] = c.plane[walls]
         row[n:, 8] = c.level[walls] - c.plane[walls] @ packed.origin  # of contacts, weights sum to zero
@@ -140,15 +143,17 @@ class ContactNodes:
         self.other, self.row = np.ascontiguousarray(other[taken]), np.ascontiguousarray(row[taken], dtype)
         self.force, self.creep = np.zeros(len(taken), dtype), c.creep
 
-    def sweep(self, x: np.ndarray, omega: float) -> None:
-        """Update every node in contact once, in place."""
+    def sweep(self, x: np.ndarray, omega: float, symmetric: bool = False) -> None:
+        """Update every node in contact once, in place, or back in reverse order of the colours besides."""
         p, r = self.packed, self.rows
         arrays = (
             x, r.seg_start, r.seg, r.idx, r.coef, r.nodal, p.parameters, np.array([omega, self.creep], p.dtype),
             self.place, self.first, self.other, self.row, self.force,
         )  # fmt: skip
         blocks = specialised(make_contact_sweep, p.functions, p.dtype)
-        run(blocks, arrays, np.arange(len(self.color_start) - 1), self.color_start, 4)
+        forward = np.arange(len(self.color_start) - 1)
+        colors = np.concatenate([forward, forward[::-1]]) if symmetric else forward
+        run(blocks, arrays, colors, self.color_start, 4)
 
 
 def _counting(count: np.ndarray) -> np.ndarray:
@@ -159,16 +164,16 @@ def _counting(count: np.ndarray) -> np.ndarray:
 
 def _neighbours(problem: Problem, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each vertex the others of ``surface`` with which it shares a cell, in compressed rows (start, vertex)."""
-    graph = scipy.sparse.csr_matrix((problem.n_vert, problem.n_vert), dtype=np.int8)
+    graph = scipy.sparse.csr_matrix((problem.n_vert, problem.n_vert), dtype=bool)
     chosen = np.zeros(problem.n_vert, bool)
     chosen[surface] = True
     for c in problem.couplings:
         vertices = c.cells[:, : c.corners]
         at, corner = np.nonzero(chosen[vertices])
-        ones = np.ones(len(at), np.int8)
+        ones = np.ones(len(at), np.int32)  # of which there is room for as many as two vertices share cells
         shape = len(vertices), problem.n_vert
         incidence = scipy.sparse.csr_matrix((ones, (at, vertices[at, corner])), shape)
-        graph = graph + (incidence.T @ incidence).astype(bool).astype(np.int8)
+        graph = graph + (incidence.T @ incidence).astype(bool)
     graph = graph.tocsr()
     graph.setdiag(0)
     graph.eliminate_zeros()
@@ -225,9 +230,7 @@ def _step(at, x, acc, l, omega, creep, low, high, other, row, force):
         k, w, F = row[c, 10], row[c, 0], row[c, 11]
         if max(k, F) > real(0):
             n = row[c, 5], row[c, 6], row[c, 7]
-            C = _gap_vector(c, at, x, other, row)
-            if real(0) < F:
-                C = C[0] - row[c, 12], C[1] - row[c, 13], C[2] - row[c, 14]
+            C = sub(_gap_vector(c, at, x, other, row), (row[c, 12], row[c, 13], row[c, 14]))
             along = dot(n, C)
             u = sub(C, scale(along, n))
             if real(0) < F:

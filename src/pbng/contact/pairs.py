@@ -73,10 +73,10 @@ class SurfaceDetector:
         self.triangles = BoxTree(X, s.triangles, s.body)
         self.edge_tree = BoxTree(X, self.edges, edge_body)
         self.tets = BoxTree(X, s.tets, s.tet_body) if len(s.tets) else None
-        self.meets_others = ~np.eye(n_body, dtype=bool)
+        self.meets_others = ~np.eye(n_body, dtype=bool) & s.others & s.others[:, None]
         self.meets_itself = np.diag(s.own)
         present = np.unique(s.body)
-        self.several, self.any_own = len(present) > 1, bool(s.own.any())
+        self.several, self.any_own = bool(self.meets_others.any()), bool(s.own.any())
         if self.any_own:
             cells = s.triangles, self.edges, s.tets
             self.near_triangles, self.near_edges, self.near_tets = (neighbourhoods(c, len(X), s.rings) for c in cells)
@@ -119,13 +119,15 @@ class SurfaceDetector:
         used = (cosine < SHARP) | ~self.solid[self.body[edges[:, 0]]]
         return edges[used], beside[used]
 
-    def find(self, x0: np.ndarray, x1: np.ndarray, dt: float | None, ahead: float, hold: float) -> Contacts:
+    def find(
+        self, x0: np.ndarray, x1: np.ndarray, dt: float | None, ahead: float, hold: float, k_tau: float
+    ) -> Contacts:
         """Contacts of a step from x0 to, it is expected, x1 (n_vert, 3), give or take ``ahead`` [m].
 
         With inertia, in a step of dt [s], contacts do not part at once what overlaps, or it would fly apart: their
         offset is one at which they push with the stress E, or as far as they may in a step. Without inertia, dt = None,
         those that resist hold on where they are until they are found anew, by ``hold`` of k_n: nothing else keeps what
-        may slide freely from sliding past what it was found with.
+        may slide freely from sliding past what it was found with. ``k_tau`` [N/m] is the stiffness of what sticks.
         """
         s = self.surfaces
         x0 = np.ascontiguousarray(x0, float)
@@ -149,7 +151,7 @@ class SurfaceDetector:
             seen[pairs[-1].vertices] = True
             edge_reach[~seen[self.edges].any(1)] = -1.0
             pairs.append(self._edge_edge(x0, edge_reach, self.meets_itself, self.near_edges))
-        return self._contacts(pairs, dt, hold)
+        return self._contacts(pairs, dt, hold, k_tau)
 
     def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Any) -> _Pairs:
         s, vertex = self.surfaces, self.vertex
@@ -267,7 +269,7 @@ class SurfaceDetector:
         a, b = self.beside[edge].T
         return triangle_areas(x, self.surfaces.triangles[a]) + triangle_areas(x, self.surfaces.triangles[b])
 
-    def _contacts(self, pairs: list[_Pairs], dt: float | None, hold: float) -> Contacts:
+    def _contacts(self, pairs: list[_Pairs], dt: float | None, hold: float, k_tau: float) -> Contacts:
         s = self.surfaces
         p = _Pairs(*(np.concatenate([getattr(q, f.name) for q in pairs]) for f in fields(_Pairs)))
         p = p.some(~self.fixed[p.vertices].all(1))
@@ -288,17 +290,18 @@ class SurfaceDetector:
         softer = s.stiffness[p.bodies].min(1)
         k_n = np.full(len(gap), s.k_n) if s.k_n is not None else STIFF * softer
         if dt is None:
-            offset, k_tau = kept, np.maximum(s.k_tau, hold * k_n)
+            offset, tangential = kept, np.maximum(k_tau, hold * k_n)
         else:
             push = np.maximum(PUSH * dt, softer / k_n) * spacing
-            offset, k_tau = np.minimum(kept, gap + push), np.full(len(gap), s.k_tau)
+            offset, tangential = np.minimum(kept, gap + push), np.full(len(gap), k_tau)
         return Contacts(
             vertices=p.vertices,
             weights=p.weights,
             normal=normal,
             offset=offset,
             k_n=k_n,
-            k_tau=np.where(gap < kept, k_tau, 0.0),
+            k_tau=np.where(gap < kept, tangential, 0.0),
+            start=apart,
             kept=kept,
         )
 
@@ -309,14 +312,20 @@ class SurfaceDetector:
         nothing = np.full(len(self.vertex), -1)
         self._forget()
         x = np.ascontiguousarray(x, float)
+        self.triangles.refit(x)
         inside, _ = self._inside(x, nothing, np.zeros((len(nothing), 3)), self.meets_others, None)
         body = self.body[self.vertex]
         for b in np.unique(body):
-            solids, count = np.unique(inside[body == b], return_counts=True)
-            if len(solids) == 1 and solids[0] >= 0:
+            mine = np.flatnonzero(body == b)
+            solid = inside[mine[0]]
+            if solid < 0 or (inside[mine] != solid).any():
+                continue
+            only = (np.arange(len(self.surfaces.names)) == solid)[None]
+            asked: dict[str, Any] = {"own": np.zeros(len(mine), np.int32), "meets": only}
+            if closest_triangles(self.triangles, x, x[self.vertex[mine]], **asked)[2].max() > CLOSE * self.radius:
                 names = self.surfaces.names
                 raise InputError(
-                    f"contact: body {names[b]!r} starts fully inside body {names[solids[0]]!r} ({count[0]} vertices);"
+                    f"contact: body {names[b]!r} starts fully inside body {names[solid]!r} ({len(mine)} vertices);"
                     " move one of them"
                 )
 

@@ -20,7 +20,8 @@ class Surfaces:
         tets: Tets of the solids among them, (k, 4) int32.
         tet_body: Body of each tet, (k,) int32.
         names: Names of all bodies of the scene.
-        own: Which bodies collide with themselves, (n_body,) bool.
+        others: Which bodies collide with each other, (n_body,) bool.
+        own: Which collide with themselves, (n_body,) bool.
         skin: Half the distance [m] that is kept from each body, (n_body,).
         stiffness: E h [N/m] of each body, (n_body,).
         spacing: Mean length of each body's edges on the surface [m], (n_body,).
@@ -34,6 +35,7 @@ class Surfaces:
     tets: np.ndarray
     tet_body: np.ndarray
     names: tuple[str, ...]
+    others: np.ndarray
     own: np.ndarray
     skin: np.ndarray
     stiffness: np.ndarray
@@ -58,9 +60,13 @@ class ContactSpec:
         surfaces: Bodies that collide with each other, or None.
         colliders: Kinematic bodies (:mod:`pbng.contact.colliders`).
         margin: Distance [m] at which a vertex that does not move counts as close to a collider.
+        bodies: For each body its name, and its first vertex and that past its last.
+        plane: Vertices of plane bodies, which stay in their plane, ascending, (k,).
     """
 
     surface: np.ndarray
     surfaces: Surfaces | None
     colliders: tuple[Any, ...]
     margin: float
+    bodies: tuple[tuple[str, int, int], ...]
+    plane: np.ndarray

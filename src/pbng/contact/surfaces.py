@@ -38,7 +38,16 @@ def contact_spec(bodies: Sequence[Body], rule: ContactRule | None, colliders: Se
     surfaces = None if rule is None else _surfaces(bodies, rule)
     vertices = [b.start + np.unique(b.faces) for b in bodies] if colliders else [surfaces.vertices]  # type: ignore[union-attr]
     spacing = [_spacing(b) for b in bodies]
-    return ContactSpec(np.unique(np.concatenate(vertices)), surfaces, tuple(colliders), NEAR * float(np.mean(spacing)))
+    ranges = tuple((b.name, b.start, b.start + b.mesh.n_vert) for b in bodies)
+    flat = [np.arange(start, stop) for b, (_, start, stop) in zip(bodies, ranges) if not has_surface(b)]
+    return ContactSpec(
+        surface=np.unique(np.concatenate(vertices)),
+        surfaces=surfaces,
+        colliders=tuple(colliders),
+        margin=NEAR * float(np.mean(spacing)),
+        bodies=ranges,
+        plane=np.concatenate(flat) if flat else np.empty(0, np.int64),
+    )
 
 
 def _surfaces(bodies: Sequence[Body], rule: ContactRule) -> Surfaces:
@@ -47,8 +56,11 @@ def _surfaces(bodies: Sequence[Body], rule: ContactRule) -> Surfaces:
     for b in {*chosen, *own}:
         if not has_surface(b):
             raise InputError(f"contact: body {b.name!r} has no surface: it is plane; contact is for solids and cloth")
-    if len(bodies) == 1 and not own and not rule.bodies:
-        raise InputError("contact: the scene has one body, and it does not collide with itself; self_collision=True?")
+    if len(set(chosen)) == 1 and not own:
+        raise InputError(
+            f"contact: body {chosen[0].name!r} is alone, and does not collide with itself; self_collision=True, or"
+            " another body?"
+        )
     triangles, body, tets, tet_body = [], [], [], []
     for number, b in enumerate(bodies):
         if not any(b is c for c in (*chosen, *own)):
@@ -65,6 +77,7 @@ def _surfaces(bodies: Sequence[Body], rule: ContactRule) -> Surfaces:
         tets=np.concatenate(tets) if tets else np.empty((0, 4), np.int32),
         tet_body=np.concatenate(tet_body) if tets else np.empty(0, np.int32),
         names=tuple(b.name for b in bodies),
+        others=np.array([any(b is c for c in chosen) for b in bodies]),
         own=np.array([any(b is c for c in own) for b in bodies]),
         skin=skin,
         stiffness=np.array([_stiffness(b) for b in bodies]),

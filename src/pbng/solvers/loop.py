@@ -59,7 +59,8 @@ def run(
     status = _verdict(history, tolerance, floor, budget.error)
     iteration, correction = 0, 0.0
     seen = -1, x  # an iteration and the state after it
-    if status is None and before is not None and (better := method.prepare(before, x)) is not None:
+    at_all = budget.cap > 0 and budget.seconds != 0
+    if status is None and at_all and before is not None and (better := method.prepare(before, x)) is not None:
         method.start(contacts.put_outside(better) if contacts is not None else better, targets, contacts)
         if refined:
             method.refine()
@@ -92,6 +93,8 @@ def run(
                         status = Status.ITERATIONS
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
+        if iteration == 0:
+            method.start(x, targets, contacts)  # of which the certificate is
     if history.monitored[-1] != iteration:
         certify(iteration)
         if status in (Status.ITERATIONS, Status.SECONDS):

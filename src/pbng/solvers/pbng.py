@@ -146,17 +146,16 @@ class PackedMethod:
         if contacts is not None:
             p = self.packed
             self.touching = ContactEnergy(contacts, p.n_slot, p.slot, p.origin)
-            with self.threads.used():
-                for nodes in self.contact_nodes.values():
-                    nodes.update(contacts)
 
     def _nodes_in_contact(self, contacts: Contacts) -> ContactNodes:
         """Their layout, in the present precision."""
         name = self.packed.dtype.name
         if name not in self.contact_nodes:
             self.contact_nodes[name] = ContactNodes(self.problem, self.packed)
-            self.contact_nodes[name].update(contacts)
-        return self.contact_nodes[name]
+        nodes = self.contact_nodes[name]
+        if nodes.contacts is not contacts:
+            nodes.update(contacts)
+        return nodes
 
     def refine(self) -> bool:
         if self.solver.dtype != "auto" or self.packed.dtype == np.float64:
@@ -201,7 +200,7 @@ class PackedMethod:
         nodes = self._nodes_in_contact(self.contacts)
         for _ in range(self.times):
             sweep(nodes.others, x, self.colors, omega)
-            nodes.sweep(x, omega)
+            nodes.sweep(x, omega, self.solver.symmetric)
 
     def admit(self, x: np.ndarray, g: np.ndarray) -> None:
         if self.touching:
@@ -239,15 +238,15 @@ class PackedMethod:
             force_scale += scale
         f = self.forces[: self.n_free] + self.f_ext[: self.n_free]
         if self.touching:
-            self.touching.balanced(self._places(f), self._places(x), self.slack(x))
+            self.touching.balance(self._places(f), self._places(x), self.slack(x))
         return f, force_scale, inverted
 
     def borne(self) -> np.ndarray:
         """With what force [N] colliders bear each vertex at the state last certified, (n_vert, 3)."""
         out = np.zeros((self.problem.n_vert, 3))
         if self.touching and self.contacts:
-            f = self.forces + self.f_ext
-            force = self.touching.borne(self._places(f)) * self.touching.held(self._places(self.x), self.slack(self.x))
+            f = self._places(self.forces + self.f_ext)
+            force = self.touching.balance(f, self._places(self.x), self.slack(self.x))
             np.add.at(out, self.contacts.vertex, force[:, None] * self.contacts.plane)
         return out
 
