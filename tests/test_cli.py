@@ -9,11 +9,13 @@ import time
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import pbng
 from pbng.cli import app
 from pbng.cli_options import parse_acceleration
+from pbng.view.residuals import residual_curves
 
 TINY = "run twisting_block --resolution 4"
 
@@ -93,6 +95,47 @@ def test_info_and_export_of_a_run(pbng_):
     code, said = pbng_("export runs/twisting_block --format obj --out objs")
     assert code == 0, said
     assert os.path.exists("objs/objs_0001.obj")
+
+
+def test_info_says_of_a_run_what_the_run_said(pbng_):
+    for words in ("--inertia --dt 0.02", "--quasistatic --rtol 1e-2"):
+        code, ran = pbng_(f"run hanging_bar --resolution 3 --frames 4 --out here --overwrite {words}")
+        assert code == 0, ran
+        code, said = pbng_("info here")
+        assert code == 0, said
+        for row in (r"iterations [\d,]+, \d+ a frame", r"residual, end median \S+ N, worst \S+ N"):
+            assert re.search(row, said).group() in ran
+        curves, xlabel = residual_curves(pbng.read_run("here"))
+        assert xlabel == "time [s]"
+        assert len(curves["end of frame"][0]) == (3 if "--inertia" in words else 4), "the start is not solved"
+
+
+def test_names_in_brackets_are_shown(pbng_):
+    pbng_(f"{TINY} --frames 1 --out bar[m]")
+    code, said = pbng_("info bar[m]")
+    assert code == 0
+    assert "bar[m]" in said
+
+
+def commands(app):
+    """Every command of a typer app, by its name."""
+    return typer.main.get_command(app).commands
+
+
+@pytest.mark.parametrize("name", sorted(commands(app)))
+def test_help_loses_no_word(name, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    command = commands(app)[name]
+    said = CliRunner().invoke(app, [name, "--help"]).output
+    said = re.sub(r"\x1b\[[0-9;]*m|[\s│]", "", said)  # colours, which some terminals are given, and the frame
+    for text in [p.help for p in command.params if getattr(p, "help", None)]:
+        assert re.sub(r"\s", "", text.replace("\\[", "[")) in said, text
+
+
+def test_help_of_bench_names_its_commands():
+    benchmarks = pytest.importorskip("pbng.bench")
+    for name in commands(benchmarks.app):
+        assert name in commands(app)["bench"].help
 
 
 def test_list_names_every_scene(pbng_):

@@ -20,8 +20,7 @@ pytest.importorskip("pyvista")
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 from pbng import view as views  # noqa: E402
-from pbng.view import colors, render, shadow, springs  # noqa: E402
-from pbng.view.occlusion import occlude  # noqa: E402
+from pbng.view import colors, render, springs  # noqa: E402
 
 
 def drawn_out(X, s):
@@ -129,41 +128,6 @@ def test_the_camera_faces_planes():
     assert np.isclose((4 - left) / width, 0.7)
 
 
-def test_shadows_are_dark_below_and_soft_with_height():
-    plate = sheet(4, height=0.0)
-    cast = shadow.Shadow(np.zeros(3), 2.0, 1.0)
-    low, high = (cast(plate.X + np.array([0, h, 0]), plate.cells) for h in (0.01, 1.0))
-    middle = shadow.PIXELS // 2
-    assert low[middle, middle] == pytest.approx(1 - np.prod([1 - s.strength for s in shadow.SOURCES]), abs=0.01)
-    assert low[:20].max() == 0
-    assert high.max() < low.max()
-    assert np.abs(np.diff(high, axis=0)).max() < 0.3 * np.abs(np.diff(low, axis=0)).max()
-
-
-def test_hollows_are_darker_than_planes():
-    h = w = 60
-    tangent = 0.1
-    toward = np.full((h, w, 3), 128, np.uint8)
-    toward[..., 2] = 255
-    plane = np.full((h, w), 10, np.float32)
-    before = np.full((2 * h, 2 * w, 3), 200, np.uint8)
-    fine = np.full((2 * h, 2 * w), 10, np.float32)
-    image = before.copy()
-    occlude(image, fine, plane, toward, tangent, 0.5, 0.01)
-    assert np.array_equal(image, before)
-    step = plane.copy()
-    step[:, :30] = 9.7  # the left half stands nearer: the right half is darker beside it
-    fine[:, :60] = 9.7
-    occlude(image, fine, step, toward, tangent, 0.5, 0.01)
-    assert image[60, 64, 0] < 185
-    assert image[60, 110, 0] == 200
-    assert image[60, 20, 0] == 200
-    fine[:], step[:] = np.inf, np.inf
-    image = before.copy()
-    occlude(image, fine, step, toward, tangent, 0.5, 0.01)
-    assert np.array_equal(image, before), "there is nothing to darken"
-
-
 @pytest.mark.parametrize("color", ["stretch", "body"])
 @pytest.mark.parametrize("frame", [0, -1])
 def test_pictures_are_well_framed(run, tmp_path, color, frame):
@@ -172,7 +136,7 @@ def test_pictures_are_well_framed(run, tmp_path, color, frame):
     if color == "stretch":  # its bar is coloured too
         assert body_pixels(image)[:, -40:].any()
         image[:, -40:] = 255
-    assert_well_framed(image, SIZE)
+    assert_well_framed(image, SIZE, least=0.06)
 
 
 def test_pictures_of_meshes_frames_and_folders(run, tmp_path):
@@ -289,6 +253,17 @@ def test_bad_input_is_named(run, tmp_path):
         views.picture((box(), np.zeros((2, 3))), tmp_path / "a.png")
     with pytest.raises(InputError, match="too small"):
         views.picture(run, tmp_path / "a.png", size=(3, 3))
+    with pytest.raises(InputError, match=r"two whole numbers of pixels, not \(100.5, 100\)"):
+        views.picture(run, tmp_path / "a.png", size=(100.5, 100))
+    with pytest.raises(InputError, match=r"width must be .*finite, not nan"):
+        views.sheet(run, tmp_path / "a.png", width=np.nan)
+    for angles in ({"azimuth": np.nan}, {"elevation": -np.inf}, {"azimuth": "left"}):
+        for draw, name in ((views.picture, "a.png"), (views.film, "a.mp4"), (views.sheet, "a.png")):
+            with pytest.raises(InputError, match="azimuth and elevation: expected 2 finite numbers, not"):
+                draw(run, tmp_path / name, **angles)
+    with pytest.raises(InputError, match="elevation must lie between -90 and 90 degrees, not 120"):
+        views.picture(run, tmp_path / "a.png", elevation=120)
+    assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("")
     for draw, name in ((views.picture, "a.png"), (views.film, "a.mp4"), (views.sheet, "a.png")):
         with pytest.raises(InputError, match=r"cannot write .*file"):

@@ -109,6 +109,22 @@ def test_solid_colliders_are_grey_and_in_the_picture(tmp_path):
     assert shares[0] < shares[1], "what stands before a body hides it, until it has moved on"
 
 
+def test_edges_between_surfaces_have_colours_between_theirs(tmp_path):
+    image = drawn(colliding([sheet(6, 1.0)], [pbng.Sphere((0, 0.6, 0), 0.35)]), tmp_path)
+    body = body_pixels(image)
+    middle = int(np.flatnonzero(body.any(0)).mean())
+    seen = 0
+    for column in range(middle - 60, middle + 60):
+        last = np.flatnonzero(body[:, column]).max()  # of the sheet; below it is the ball in its shade
+        above, below = image[last - 3, column], image[last + 4, column]
+        between = image[last - 2 : last + 4, column]
+        if below.max() < 160:
+            assert (between >= np.minimum(above, below) - 8).all()
+            assert (between <= np.maximum(above, below) + 8).all()
+            seen += 1
+    assert seen > 40
+
+
 def test_colliders_of_stored_runs_and_of_states_are_drawn(tmp_path):
     press = pbng.Plane((0, 1, 0), (0, -1, 0), motion=pbng.Translate((0, -0.3, 0)), over=1 / 30)
     ball = pbng.Sphere((1.6, 0.5, 0.5), 0.5, motion=pbng.Translate((0.5, 0, 0)), over=1 / 30)

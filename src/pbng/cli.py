@@ -1,4 +1,5 @@
-"""The command line: ``pbng run``, ``compare``, ``demo``, ``list``, ``info``, ``view``, ``export``, ``bench``.
+"""The command line: ``pbng run``, ``compare``, ``demo``, ``reproduce``, ``list``, ``info``, ``view``, ``export``,
+``bench``.
 
 What is heavy is imported inside the commands, so that ``pbng --help`` answers at once.
 """
@@ -65,8 +66,8 @@ def run(
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="At most so many iterations a frame.")] = None,
     rtol: Annotated[float | None, typer.Option(help="Until the residual of a frame is this part of its first.")] = None,
-    atol: Annotated[float | None, typer.Option(help="Until the residual is below this [N].")] = None,
-    error: Annotated[float | None, typer.Option(help="Until the estimated position error is below this [m].")] = None,
+    atol: Annotated[float | None, typer.Option(help="Until the residual is below this \\[N].")] = None,
+    error: Annotated[float | None, typer.Option(help="Until the estimated position error is below this \\[m].")] = None,
     seconds: Annotated[float | None, typer.Option(help="At most so many seconds a frame.")] = None,
     dtype: Annotated[str | None, typer.Option(help="Precision of the sweeps: float32, float64 or auto.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads to use; by default all.")] = None,
@@ -76,7 +77,7 @@ def run(
         bool | None,
         typer.Option("--inertia/--quasistatic", help="Backward Euler, or equilibria; by default as the scene says."),
     ] = None,
-    dt: Annotated[float | None, typer.Option(help="With inertia: longest time step [s].")] = None,
+    dt: Annotated[float | None, typer.Option(help="With inertia: longest time step \\[s].")] = None,
     substeps: Annotated[int | None, typer.Option(help="With inertia: steps a frame.")] = None,
     to: Annotated[Path | None, typer.Option("--out", help="Folder of the run; by default runs/NAME.")] = None,
     overwrite: Overwrite = False,
@@ -133,7 +134,7 @@ def compare(
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="At most so many iterations of each.", min=1)] = None,
     seconds: Annotated[float | None, typer.Option(help="At most so many seconds of solving by each; or 4.")] = None,
-    at: Annotated[float | None, typer.Option(help="Time of the motions [s]; by default their end.")] = None,
+    at: Annotated[float | None, typer.Option(help="Time of the motions \\[s]; by default their end.")] = None,
     hard: Annotated[bool, typer.Option("--hard", help="Start with free vertices scattered at random.")] = False,
     seed: Annotated[int, typer.Option(help="Of --hard.")] = 0,
     rounds: Annotated[int, typer.Option(help="Times are medians over so many rounds.", min=1)] = 1,
@@ -204,9 +205,9 @@ def info(
     """Say what a mesh or a run is, and how good."""
     from pbng.cli_info import mesh_rows, run_rows
 
-    shown = table(str(what), show_header=False, pad_edge=False)
+    shown = table(escape(str(what)), show_header=False, pad_edge=False)
     for name, value in run_rows(what) if what.is_dir() else mesh_rows(what):
-        shown.add_row(name, value)
+        shown.add_row(escape(name), escape(value))
     out.print(shown)
 
 
@@ -241,7 +242,7 @@ def export(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
 )
 def bench(context: typer.Context) -> None:
-    """Measure: time of a sweep, convergence, accuracy, cycles, poses, frames. See `pbng bench --help`."""
+    """Measure sweeps, convergence, accuracy, cycles, poses, frames, contact, cloth. See `pbng bench --help`."""
     try:
         from pbng.bench import app as benchmarks
     except ModuleNotFoundError as error:

@@ -10,6 +10,7 @@ from pbng.errors import InputError
 from pbng.io.frames import read_run
 from pbng.io.meshes import MESHES, SURFACES, read_mesh, read_surface
 from pbng.mesh_quality import quality
+from pbng.view.residuals import solved
 
 Rows = Iterator[tuple[str, str]]
 
@@ -37,6 +38,7 @@ def run_rows(folder: Path) -> Rows:
     for body in run.bodies:
         cells = f"{body.mesh.n_elem:,} {body.mesh.cell_name}s"
         yield f"body {body.name}", f"{body.mesh.n_vert:,} vertices, {cells}"
+    frames = list(solved(frames, frames[0].v is not None))
     yield "ended", ", ".join(f"{n} {status.lower()}" for status, n in Counter(f.status for f in frames).items())
     iterations = sum(f.iterations for f in frames)
     yield "iterations", f"{iterations:,}, {iterations / len(frames):.0f} a frame"

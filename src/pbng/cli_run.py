@@ -23,6 +23,7 @@ from pbng.io.frames import FrameWriter
 from pbng.problem import Problem
 from pbng.solvers import base
 from pbng.solvers.base import Budget, Result, Solver, Status
+from pbng.view.residuals import solved
 
 SWINGING = 1.0  # how long [s] to look on after the last motion has ended, where there is inertia
 
@@ -217,8 +218,7 @@ def _kept(report: Report) -> str:
 
 def _rows(report: Report, results: list[Result], compiled: float) -> Iterator[tuple[str, str]]:
     problem, setup_seconds = report.problem, results[0].setup_seconds
-    if report.last is not None and report.last.v is not None:
-        results = results[1:] or results  # the first frame is the start
+    results = list(solved(results, report.last is not None and report.last.v is not None))
     iterations = sum(r.iterations for r in results)
     seconds = sum(r.seconds for r in results)
     # A frame that begins at rounding level, as one at rest does, has nothing to reduce.

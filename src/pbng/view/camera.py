@@ -1,16 +1,19 @@
 """Where the camera stands: once for a whole motion, so that all of it is in the picture and nothing jumps."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pbng.checks import checked_vector
+from pbng.errors import InputError
 from pbng.view.surface import Motion, Surface, springs_of
 
 VIEW_ANGLE = 18.0  # [degrees] from the bottom to the top of the picture: a long lens, for calm perspective
 # Of the size of what the bodies sweep: a collider that reaches no farther from them is in the picture, and of others,
 # such as a large ground, what is that near.
 FAR, NEAR = 1.5, 0.5
+
+Margins = tuple[float, float, float, float]  # left, right, bottom, top
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +23,13 @@ class Extent:
     Attributes:
         points: Those of the bodies, followed by those of colliders, the ends of weak constraints, and others.
         n_bodies, n_surface: How many are of the bodies, and of these and colliders; None for all.
+        shadows: Where shadows fall, (k, 3) [m]: in the picture too, but nearer to its edge than the points.
     """
 
     points: np.ndarray
     n_bodies: int | None = None
     n_surface: int | None = None
+    shadows: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
     @classmethod
     def of(cls, motion: Motion, surface: Surface) -> "Extent":
@@ -110,13 +115,22 @@ class Camera:
         return np.stack([column / 2, row / 2, -back], axis=1)
 
 
+def checked_angles(azimuth: float, elevation: float) -> tuple[float, float]:
+    """The two angles [degrees] of a camera; InputError if they are none."""
+    azimuth, elevation = checked_vector("azimuth and elevation", (azimuth, elevation), 2)
+    if abs(elevation) > 90:
+        raise InputError(f"elevation must lie between -90 and 90 degrees, not {elevation:g}")
+    return azimuth, elevation
+
+
 def framed(
     extent: Extent,
     aspect: float,
     *,
     azimuth: float = 28.0,
     elevation: float = 20.0,
-    margins: tuple[float, float, float, float] = (0.08, 0.08, 0.08, 0.08),
+    margins: Margins = (0.08, 0.08, 0.08, 0.08),
+    shadow_margins: Margins = (0.08, 0.08, 0.08, 0.08),
 ) -> Camera:
     """A camera that sees all of an extent, as near as the margins allow.
 
@@ -126,23 +140,26 @@ def framed(
         azimuth: Angle [degrees] from the z axis, towards x, at which the camera stands.
         elevation: Angle [degrees] at which it looks down.
         margins: Left, right, bottom and top, as shares of the picture's width or height.
+        shadow_margins: The same for shadows.
     """
     a, e = np.radians(azimuth), np.radians(elevation)
     back = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
     right = np.array([np.cos(a), 0.0, -np.sin(a)])
     up = np.cross(back, right)
     half = np.tan(np.radians(VIEW_ANGLE) / 2)
-    left_m, right_m, bottom_m, top_m = margins
-    side, depth, height = extent.points @ right, extent.points @ -back, extent.points @ up
     # The picture is a window in the plane one metre ahead; each edge of it gives a plane that all points lie within.
-    x, near_x = _between(side, depth, half * aspect * (1 - 2 * left_m), half * aspect * (1 - 2 * right_m))
-    y, near_y = _between(height, depth, half * (1 - 2 * bottom_m), half * (1 - 2 * top_m))
-    z = min(near_x, near_y, float(depth.min()) - 0.5 * extent.size)
-    position = x(z) * right + y(z) * up - z * back
+    across, upward, nearest = [], [], float((extent.points @ -back).min()) - 0.5 * extent.size
+    for points, (left_m, right_m, bottom_m, top_m) in ((extent.points, margins), (extent.shadows, shadow_margins)):
+        if len(points):
+            depth = points @ -back
+            across.append(_Between.of(points @ right, depth, *(half * aspect * (1 - 2 * m) for m in (left_m, right_m))))
+            upward.append(_Between.of(points @ up, depth, *(half * (1 - 2 * m) for m in (bottom_m, top_m))))
+    z = min(_nearest(across), _nearest(upward), nearest)
+    position = _place(across, z) * right + _place(upward, z) * up - z * back
     return Camera(position, position - back * extent.size, up)
 
 
-def facing(extent: Extent, aspect: float, margins: tuple[float, float, float, float]) -> Camera:
+def facing(extent: Extent, aspect: float, margins: Margins) -> Camera:
     """A camera without perspective that looks at the x-y plane, for plane meshes."""
     left, right, bottom, top = margins
     size = np.maximum((extent.high - extent.low)[:2], 1e-9 * extent.size)
@@ -157,17 +174,38 @@ def projected_aspect(extent: Extent, azimuth: float, elevation: float) -> float:
     """Width over height of what a motion covers in a picture by :func:`framed`."""
     camera = framed(extent, 1.0, azimuth=azimuth, elevation=elevation)
     back = (camera.position - camera.focus) / extent.size
-    ray = extent.points - camera.position
+    ray = np.concatenate([extent.points, extent.shadows]) - camera.position
     depth = ray @ -back
     across, upward = ray @ np.cross(camera.up, back) / depth, ray @ camera.up / depth
     return float(np.ptp(across) / max(np.ptp(upward), 1e-9))
 
 
-def _between(across: np.ndarray, depth: np.ndarray, low: float, high: float) -> tuple[Callable[[float], float], float]:
-    """The greatest depth from which all points are within slopes -low and high, and the middle place at a depth."""
-    beyond_high, beyond_low = (across - high * depth).max(), (-across - low * depth).max()
-    nearest = -(beyond_high + beyond_low) / (high + low)
-    return lambda z: (beyond_high + high * z - beyond_low - low * z) / 2, float(nearest)
+@dataclass(frozen=True)
+class _Between:
+    """Points between two edges of the picture: they are if the camera, at depth z, is not below ``high z + least``
+    nor above ``-low z - most``.
+    """
+
+    low: float
+    high: float
+    least: float
+    most: float
+
+    @classmethod
+    def of(cls, across: np.ndarray, depth: np.ndarray, low: float, high: float) -> "_Between":
+        """Of points at such places and depths (n,), those that are to be seen within slopes -low and high."""
+        return cls(low, high, float((across - high * depth).max()), float((-across - low * depth).max()))
+
+
+def _nearest(groups: list[_Between]) -> float:
+    """The greatest depth from which all points of all groups are between their edges."""
+    return min(-(a.least + b.most) / (a.high + b.low) for a in groups for b in groups)
+
+
+def _place(groups: list[_Between], z: float) -> float:
+    """From where they are so at a depth: where the first group is in the middle, or as near to it as the others let."""
+    least, most = [g.high * z + g.least for g in groups], [-g.low * z - g.most for g in groups]
+    return min(max((least[0] + most[0]) / 2, *least), *most)
 
 
 def _outermost(points: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ a pattern of four by four pixels that a blur, which stops at jumps of depth, tak
 import numpy as np
 from numba import prange
 
-from pbng.jit import kernel
+from pbng.jit import kernel, leaf
 
 SAMPLES = 16
 TURNS = 5.0  # of the spiral
@@ -17,6 +17,7 @@ MOST_PIXELS = 60.0  # greatest radius looked at
 FLAT = 0.10  # sine of the rise that is overlooked
 DEEP = 0.25  # share of the darkness that the deepest hollows are spared, or folds of cloth would be black
 GREY = 40.0  # difference between the channels of a colour below which it is more or less grey
+BLOCK = 3  # [samples] side of the squares that share one light where they show one surface
 BLUR = 4  # [pixels] half the width of the blur, the side of the pattern
 
 
@@ -31,10 +32,13 @@ def occlude(
 ) -> None:
     """Darken an image (h, w, 3) uint8, in place, where little light from around arrives.
 
+    An image that is to be made smaller is given as it was drawn: once a pixel is a mixture of two surfaces, no light
+    suits both.
+
     Args:
         image: The picture.
         depth: Distance (h, w) float32 [m] from the camera along its axis, infinite where there is nothing.
-        coarse: The same in half the resolution.
+        coarse: The same in a smaller image (m, n) of the same view.
         normals: Unit normals there along the camera's right, up and back, each from 0 for -1 to 255 for 1.
         tangent: Half the height of the picture at a distance of 1.
         radius: How far [m] things hide light from each other.
@@ -110,26 +114,52 @@ def _smooth(image, depth, jump, di, dj, out):
             out[i, j] = total / weights
 
 
+@leaf
+def _darkness(y, x, z, light, coarse, jump):
+    """How dark it is at distance z [m] at a row and column (y, x) of the smaller image, which may be between two."""
+    h, w = coarse.shape
+    i, j = int(np.floor(y)), int(np.floor(x))
+    total, weights = 1e-6, 1e-6
+    for p in range(max(i, 0), min(i + 2, h)):
+        for q in range(max(j, 0), min(j + 2, w)):
+            if coarse[p, q] < np.inf:
+                near = (1.0 - abs(p - y)) * (1.0 - abs(q - x))
+                weight = max(1e-6, near * (1.0 - abs(coarse[p, q] - z) / jump))
+                total += weight * light[p, q]
+                weights += weight
+    dark = max(0.0, 1.0 - total / weights)
+    return dark - DEEP * dark * dark
+
+
 @kernel
 def _darken(image, depth, light, coarse, jump):
     h, w = depth.shape
-    for i in prange(h):
-        for j in range(w):
-            z = depth[i, j]
-            if not z < np.inf:
+    m, n = coarse.shape
+    for i in prange((h + BLOCK - 1) // BLOCK):
+        for j in range((w + BLOCK - 1) // BLOCK):
+            rows, columns = range(BLOCK * i, min(h, BLOCK * (i + 1))), range(BLOCK * j, min(w, BLOCK * (j + 1)))
+            low, high = np.inf, -np.inf
+            for p in rows:
+                for q in columns:
+                    low, high = min(low, depth[p, q]), max(high, depth[p, q])
+            if not low < np.inf:
                 continue
-            total, weights = 0.0, 1e-6
-            for p in range(i // 2, min((i + 1) // 2 + 1, coarse.shape[0])):
-                for q in range(j // 2, min((j + 1) // 2 + 1, coarse.shape[1])):
-                    if coarse[p, q] < np.inf:
-                        weight = max(1e-6, 1.0 - abs(coarse[p, q] - z) / jump)
-                        total += weight * light[p, q]
-                        weights += weight
-            dark = max(0.0, 1.0 - (total + 1e-6) / weights)
-            dark -= DEEP * dark * dark
-            # Darkened colours keep their warmth: red fades least, as in light thrown to and fro. Grey has none.
-            red, green, blue = float(image[i, j, 0]), float(image[i, j, 1]), float(image[i, j, 2])
-            warm = min(1.0, (max(red, green, blue) - min(red, green, blue)) / GREY)
-            image[i, j, 0] = int(image[i, j, 0] * (1.0 - (0.78 - 0.06 * warm) * dark) + 0.5)
-            image[i, j, 1] = int(image[i, j, 1] * (1.0 - 0.78 * dark) + 0.5)
-            image[i, j, 2] = int(image[i, j, 2] * (1.0 - 0.78 * dark) + 0.5)
+            # Most blocks show one surface, and light has no detail as fine as they are.
+            alike = high - low < 0.25 * jump
+            y, x = (i + 0.5) * BLOCK * m / h - 0.5, (j + 0.5) * BLOCK * n / w - 0.5
+            dark = _darkness(y, x, low, light, coarse, jump) if alike else 0.0
+            if alike and dark == 0.0:
+                continue
+            for p in rows:
+                for q in columns:
+                    if not alike:
+                        if not depth[p, q] < np.inf:
+                            continue
+                        y, x = (p + 0.5) * m / h - 0.5, (q + 0.5) * n / w - 0.5
+                        dark = _darkness(y, x, depth[p, q], light, coarse, jump)
+                    # Darkened colours keep their warmth: red fades least, as in light thrown to and fro. Grey has none.
+                    red, green, blue = float(image[p, q, 0]), float(image[p, q, 1]), float(image[p, q, 2])
+                    warm = min(1.0, (max(red, green, blue) - min(red, green, blue)) / GREY)
+                    image[p, q, 0] = int(red * (1.0 - (0.78 - 0.06 * warm) * dark) + 0.5)
+                    image[p, q, 1] = int(green * (1.0 - 0.78 * dark) + 0.5)
+                    image[p, q, 2] = int(blue * (1.0 - 0.78 * dark) + 0.5)

@@ -9,19 +9,23 @@ from typing import Any
 
 import numpy as np
 
+from pbng.checks import checked_number
 from pbng.errors import InputError
 from pbng.io.frames import Run
-from pbng.view.camera import Extent, facing, framed, projected_aspect
+from pbng.view.camera import Extent, checked_angles, facing, framed, projected_aspect
 from pbng.view.colors import Paint, stretch_map, touching
 from pbng.view.dots import Dots
 from pbng.view.panes import APART, Panes
 from pbng.view.plots import caption, color_bar, over, plot_residuals
+from pbng.view.residuals import residual_curves
+from pbng.view.shadow import landed, leaning
 from pbng.view.springs import Springs
-from pbng.view.stage import Floor, Stage
+from pbng.view.stage import Floor, Stage, smooth
 from pbng.view.surface import Motion, Surface, springs_of
 from pbng.view.video import Video
 
 MARGIN = 0.07
+RAMP = 0.2  # share of a tile over which its shadows fade towards its edges, or the seams would show
 BAR = 118  # width [pixels at a height of 720] that a colour bar needs
 
 
@@ -54,7 +58,8 @@ def picture(
         elevation: Angle [degrees] at which it looks down.
 
     Raises:
-        InputError: There is nothing to draw, the frame or the colour is unknown, or the file cannot be written.
+        InputError: There is nothing to draw, the frame or the colour is unknown, the size or an angle is not usable, or
+            the file cannot be written.
     """
     motion = Motion.of(source)
     if not -len(motion) <= frame < len(motion):
@@ -112,6 +117,7 @@ def sheet(
     if captions is not None and len(captions) != len(motion):
         raise InputError(f"there are {len(captions)} captions for {len(motion)} frames")
     chosen = np.unique(np.linspace(0, len(motion) - 1, max(1, min(frames, len(motion)))).round().astype(int))
+    width = round(checked_number("width", width))
     path = _ready(path)
     artist = Artist(motion, color, edges, azimuth, elevation)
     unit = width / 1600
@@ -141,7 +147,7 @@ def view(source: Any, out: str | os.PathLike[str] | None = None, color: str = "s
     written = [picture(run, folder / "last.png", color=color)]
     if len(run) > 1:
         written += [sheet(run, folder / "strip.png", color=color), film(run, folder / "film.mp4", color=color)]
-    series, xlabel = _residuals(run)
+    series, xlabel = residual_curves(run)
     return [*written, plot_residuals(series, folder / "residuals.png", xlabel, "residual [N]", run.name)]
 
 
@@ -151,12 +157,17 @@ class Artist:
     def __init__(self, motion: Motion, color: str, edges: bool | None, azimuth: float, elevation: float) -> None:
         self.plane = motion.is_plane()
         self.edges = self.plane if edges is None else edges
-        self.angles = azimuth, elevation
+        self.angles = checked_angles(azimuth, elevation)
         self.surface = Surface(motion)
         self.motion = motion
         swept = Extent.of(motion, self.surface)
         self.panes = Panes(motion, swept)
         self.extent = swept.joined(self.panes.swept)
+        self.floor: Floor | None = None
+        if not self.plane:
+            self.floor = self._floor()
+            shadows = landed(self.extent.surface.points, float(self.floor.centre[1]), self.floor.lean)
+            self.extent = replace(self.extent, shadows=shadows)
         self.reach = 0.4 * float(np.median([np.linalg.norm(np.ptp(body.mesh.X, axis=0)) for body in motion.bodies]))
         self.paint = Paint(self.surface, motion, color)
         self.springs, self.dots = Springs(springs_of(motion.frames[0])), Dots(self.surface.edge)
@@ -164,17 +175,28 @@ class Artist:
 
     def stage(self, size: tuple[int, int], *, tile: bool = False, sampling: int = 3) -> Stage:
         """A stage of the size [pixels], with room for the colour bar; a tile has neither that nor a tinted floor."""
+        if len(size) != 2 or not all(isinstance(n, int | np.integer) for n in size):
+            raise InputError(f"size: expected two whole numbers of pixels, not {size!r}")
         if min(size) < 16:
             raise InputError(f"a picture of {size[0]} x {size[1]} pixels is too small")
         aspect = size[0] / size[1]
         room = BAR * size[1] / 720 / size[0] if self.paint.bar and not tile else 0.0
         margins = (MARGIN, max(MARGIN, room), 1.6 * MARGIN, 0.8 * MARGIN)  # below there is shadow
         if self.plane:
-            camera, floor, reach = facing(self.extent, aspect, margins), None, 0.0
+            camera, reach = facing(self.extent, aspect, margins), 0.0
         else:
             azimuth, elevation = self.angles
-            camera = framed(self.extent, aspect, azimuth=azimuth, elevation=elevation, margins=margins)
-            floor, reach = self._floor(tile), self.reach
+            rim = 0.5 * MARGIN
+            camera = framed(
+                self.extent,
+                aspect,
+                azimuth=azimuth,
+                elevation=elevation,
+                margins=margins,
+                shadow_margins=(rim, max(rim, room), rim, rim),
+            )
+            reach = self.reach
+        floor = replace(self.floor, tint=0.0, ramp=RAMP) if tile and self.floor is not None else self.floor
         return Stage(
             self.surface,
             camera,
@@ -210,15 +232,15 @@ class Artist:
             self._bar = color_bar(size, *self.paint.bar, stretch_map(), "largest principal stretch", unit)
         return over(image, self._bar)
 
-    def _floor(self, tile: bool) -> Floor:
+    def _floor(self) -> Floor:
         seen = self.extent.surface  # springs and panes cast no shadow, but the floor is below them too
         low, high = seen.low, seen.high
         low[1] = self.extent.low[1] if self.panes.floor is None else self.panes.floor
         centre = (low + high) / 2
         centre[1] = low[1] - APART * seen.size  # below what lies on it, or the two would mix
         reach = np.hypot(*(high - low)[[0, 2]]) / 2
-        floor = Floor(centre, 1.6 * reach + 1.1 * (high - low)[1], float(high[1] - centre[1]))
-        return replace(floor, tint=0.0) if tile else floor
+        half, top = 1.6 * reach + 1.1 * (high - low)[1], float(high[1] - centre[1])
+        return Floor(centre, half, top, leaning(seen.points, float(centre[1])))
 
 
 def _tiles(n: int, aspect: float, width: int) -> tuple[int, tuple[int, int]]:
@@ -236,18 +258,8 @@ def _tiles(n: int, aspect: float, width: int) -> tuple[int, tuple[int, int]]:
 
 def faded(image: np.ndarray) -> np.ndarray:
     """The image turning white towards its edges, within the margins, so that no seam shows between tiles."""
-    ramps = [np.clip((np.minimum(k := np.arange(n), n - 1 - k)) / (1.3 * MARGIN * n), 0, 1) for n in image.shape[:2]]
-    rows, columns = (ramp * ramp * (3 - 2 * ramp) for ramp in ramps)
+    rows, columns = (smooth(np.minimum(k := np.arange(n), n - 1 - k) / (1.3 * MARGIN * n)) for n in image.shape[:2])
     return np.rint(255 - (255 - image) * (rows[:, None] * columns)[..., None]).astype(np.uint8)
-
-
-def _residuals(run: Run) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], str]:
-    """Curves of the residuals: over the iterations of the one frame, or before and after those of each frame."""
-    if len(run) == 1:
-        frame = run[0]
-        return {frame.status.lower(): (frame.monitored, frame.residuals)}, "iteration"
-    t, first, last = np.array([(frame.t, frame.residuals[0], frame.residuals[-1]) for frame in run]).T
-    return {"start of frame": (t, first), "end of frame": (t, last)}, "time [s]"
 
 
 def _shown(items: range, what: str) -> Iterable[int]:

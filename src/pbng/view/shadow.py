@@ -8,25 +8,42 @@ wider one of the sky above that grounds what touches the floor.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from pbng.jit import serial
 
 PIXELS = 384  # side of the shadow's image
 LAYERS = 6  # distances over which the blur grows
+ASIDE = 0.25  # of the width of all that casts shadows: no shadow falls farther aside than that
 
 
 @dataclass(frozen=True)
 class _Source:
-    direction: tuple[float, float, float]  # from the light, y downwards
+    aside: tuple[float, float]  # how far along x and z a shadow falls for each metre of height
     spread: float  # blur of the edge for each metre of height, relative to it
     strength: float
 
 
 SOURCES = (
-    _Source((0.42, -1.0, -0.42), 0.10, 0.34),
-    _Source((0.0, -1.0, 0.0), 0.55, 0.30),
+    _Source((0.42, -0.42), 0.10, 0.34),
+    _Source((0.0, 0.0), 0.55, 0.30),
 )
+
+
+def leaning(points: np.ndarray, floor: float) -> float:
+    """How much of its slant the main light keeps, 0 to 1, when points (n, 3) [m] cast shadows on a floor of a height
+    [m]: it stands the steeper the higher they are, or a picture of them with their shadows would show both small.
+    """
+    width = np.hypot(*np.ptp(points[:, [0, 2]], axis=0))
+    farthest = np.hypot(*SOURCES[0].aside) * (points[:, 1].max() - floor)
+    return float(ASIDE * width / max(farthest, ASIDE * width, 1e-9))
+
+
+def landed(points: np.ndarray, floor: float, lean: float) -> np.ndarray:
+    """Where the main light casts the shadows of points (n, 3) [m], their soft rims included: (4 n, 3) on the floor."""
+    main, height = SOURCES[0], points[:, 1:2] - floor
+    middle = points[:, [0, 2]] + lean * height * main.aside
+    rims = [middle + main.spread * height * corner for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1))]
+    return np.insert(np.concatenate(rims), 1, floor, axis=1)
 
 
 @serial
@@ -58,11 +75,11 @@ def _lowest(points, height, triangles, image):
 class Shadow:
     """Shadows on the square of the floor with the given centre (x, y, z) and half its side [m].
 
-    ``top`` is the greatest height [m] above the floor of whatever will cast them.
+    ``top`` is the greatest height [m] above the floor of whatever will cast them, ``lean`` as :func:`leaning` says.
     """
 
-    def __init__(self, centre: np.ndarray, half: float, top: float) -> None:
-        self.centre, self.half = centre, half
+    def __init__(self, centre: np.ndarray, half: float, top: float, lean: float = 1.0) -> None:
+        self.centre, self.half, self.lean = centre, half, lean
         self.heights = np.linspace(0, 1, LAYERS) ** 2 * max(top, 1e-9)
 
     def __call__(self, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -75,24 +92,43 @@ class Shadow:
     def _hidden(self, points: np.ndarray, triangles: np.ndarray, source: _Source) -> np.ndarray:
         scale = PIXELS / (2 * self.half)  # pixels a metre
         height = points[:, 1].astype(np.float64) - self.centre[1]
-        along = np.array([source.direction[0], source.direction[2]]) / -source.direction[1]
-        landed = points[:, [0, 2]] - self.centre[[0, 2]] + height[:, None] * along
+        place = points[:, [0, 2]] - self.centre[[0, 2]] + self.lean * height[:, None] * source.aside
         lowest = np.full((PIXELS, PIXELS), np.inf)
-        _lowest((landed + self.half) * scale - 0.5, height, triangles, lowest)
+        _lowest((place + self.half) * scale - 0.5, height, triangles, lowest)
         hit = np.isfinite(lowest)
         lowest[~hit] = 0
-        hidden = np.zeros_like(lowest)
+        light, below = np.ones_like(lowest), np.zeros_like(lowest)
         # Each hidden pixel is shared between the two layers around its height, so that nothing jumps as it moves.
         for k, height_k in enumerate(self.heights):
             share = hit * np.interp(lowest, self.heights, np.arange(LAYERS) == k)
             if share.any():
-                hidden += _blurred(share, 1.0 + source.spread * height_k * scale)
-        return np.minimum(hidden, 1.0)
+                sigma = 1.0 + source.spread * height_k * scale
+                # What is below a layer hides part of it, where it is taken to be as around: a hole there would let
+                # light in around what is below.
+                seen = 1 - _blurred(below, sigma) if below.any() else 1.0
+                light *= 1 - np.clip(_blurred(share, sigma) / np.maximum(seen, 1e-3), 0, 1)
+                below += share
+        return 1 - light
 
 
 def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
     """Two running means, which are close to a Gaussian of standard deviation ``sigma`` [pixels] and far cheaper."""
-    width = 2 * round(1.22 * sigma) + 1
-    for _ in range(2):
-        image = uniform_filter(image, width, mode="constant")
+    half = round(1.22 * sigma)
+    for _ in range(2):  # along either axis
+        image = np.ascontiguousarray(_mean(_mean(image, half), half).T)
     return image
+
+
+@serial
+def _mean(image, half):
+    """Means (h, w) of 2 half + 1 pixels along the first axis, with 0 around the image."""
+    h, w = image.shape
+    out, total = np.empty_like(image), np.zeros(w)
+    for i in range(-half, h):
+        if i + half < h:
+            total += image[i + half]
+        if i - half - 1 >= 0:
+            total -= image[i - half - 1]
+        if i >= 0:
+            out[i] = total / (2 * half + 1)
+    return out

@@ -19,14 +19,17 @@ from pbng.view.window import INK, Window
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """A square: its centre (x, y, z) [m], half its side [m], the greatest height [m] of anything above it, and how dark
-    it is where no shadow falls.
+    """A square: its centre (x, y, z) [m], half its side [m], the greatest height [m] of anything above it, how much the
+    light leans (:func:`pbng.view.shadow.leaning`), how dark it is where no shadow falls, and over what share of the
+    picture's width and height it fades towards the picture's edges.
     """
 
     centre: np.ndarray
     half: float
     top: float
+    lean: float
     tint: float = 0.055
+    ramp: float = 0.0
 
 
 class Stage:
@@ -72,7 +75,7 @@ class Stage:
         self.window = Window(n, triangles, camera, large, 0.8 * sampling if edges else 0.0)
         # Light from around has no fine detail: it is found in an image of half the size, which shows the normals.
         self.guide = Window(n, triangles, camera, ((size[0] + 1) // 2, (size[1] + 1) // 2)) if reach > 0 else None
-        self.shadow = None if floor is None else self._lay(floor)
+        self.shadow = None if floor is None else self._lay(floor, size)
         if len(panes):
             self.window.add_panes(len(panes))
 
@@ -99,20 +102,18 @@ class Stage:
         else:
             lit = (np.minimum(color * self.light(side), 255).astype(np.uint8) for side in (normals, -normals))
             self.window.draw(points, *lit)
-        image = _shrunk(self.window.image(), self.sampling)
-        marks = len(springs) or len(panes) or len(dots)
-        fine = self.window.depth() if marks else None  # before anything else is drawn
+        image, depth = self.window.image(), self.window.depth()
         if self.guide is not None:
             seen = normals @ self.frame.T
             self.guide.draw(points, *(np.rint(127.5 * (side + 1)).astype(np.uint8) for side in (seen, -seen)))
             tangent = np.tan(np.radians(VIEW_ANGLE) / 2)
-            step = self.surface.edge
-            depth = self.window.depth(self.sampling)
-            occlude(image, depth, self.guide.depth(), self.guide.image(), tangent, self.reach, step)
-        if fine is not None:
-            lay_lines(image, fine, self.camera, edges(panes), LINE_WIDTH, LINE, LINE_OPACITY)
-            self.dots.draw(image, fine, self.camera, dots)
-            self.springs.draw(image, fine, self.camera, springs)
+            # Before the image is made smaller: on an edge between two surfaces each has light of its own.
+            occlude(image, depth, self.guide.depth(), self.guide.image(), tangent, self.reach, self.surface.edge)
+        image = _shrunk(image, self.sampling)
+        if len(springs) or len(panes) or len(dots):
+            lay_lines(image, depth, self.camera, edges(panes), LINE_WIDTH, LINE, LINE_OPACITY)
+            self.dots.draw(image, depth, self.camera, dots)
+            self.springs.draw(image, depth, self.camera, springs)
         return image
 
     def close(self) -> None:
@@ -126,10 +127,10 @@ class Stage:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _lay(self, floor: Floor) -> Callable[[np.ndarray, np.ndarray], None]:
+    def _lay(self, floor: Floor, size: tuple[int, int]) -> Callable[[np.ndarray, np.ndarray], None]:
         """A floor that is all shadow: of one colour, as opaque as it is dark, gone towards its rim."""
         pv = self.window.pv
-        cast = Shadow(floor.centre, floor.half, floor.top)
+        cast = Shadow(floor.centre, floor.half, floor.top, floor.lean)
         corners = floor.centre + floor.half * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
         quad = pv.PolyData.from_regular_faces(corners, [[0, 3, 2, 1]])
         quad.active_texture_coordinates = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
@@ -139,9 +140,13 @@ class Stage:
         texture.InterpolateOn()
         self.window.plotter.add_mesh(quad, texture=texture, lighting=False, render=False, reset_camera=False)
         axis = (np.arange(PIXELS) + 0.5) / PIXELS * 2 - 1
-        radius = np.hypot(axis[:, None], axis)
-        fade = np.clip((1 - radius) / 0.75, 0, 1)
-        fade = fade * fade * (3 - 2 * fade)
+        fade = smooth((1 - np.hypot(axis[:, None], axis)) / 0.75)
+        if floor.ramp > 0:
+            spots = np.stack(np.broadcast_arrays(axis, 0.0, axis[:, None]), axis=2).reshape(-1, 3)
+            places = self.camera.seen(floor.centre + floor.half * spots, size)
+            inside = np.minimum(places[:, :2], size - places[:, :2]) / size  # shares of the picture, from its edge
+            inside[places[:, 2] <= 0] = 0
+            fade *= smooth(inside / floor.ramp).prod(1).reshape(fade.shape)
         noise = np.random.default_rng(0).random(fade.shape)  # or so few levels would show as rings
 
         def update(points: np.ndarray, triangles: np.ndarray) -> None:
@@ -150,6 +155,12 @@ class Stage:
             image.Modified()
 
         return update
+
+
+def smooth(share: np.ndarray) -> np.ndarray:
+    """From 0 to 1 as the shares (...) do, without corners."""
+    share = np.clip(share, 0, 1)
+    return share * share * (3 - 2 * share)
 
 
 def _shrunk(image: np.ndarray, k: int) -> np.ndarray:

@@ -8,8 +8,10 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from numba import prange
 
 from pbng.errors import InputError
+from pbng.jit import kernel
 from pbng.view.camera import VIEW_ANGLE, Camera
 
 INK = (38, 44, 56)  # colour of shadows and edges
@@ -95,22 +97,17 @@ class Window:
         self.plotter.ren_win.GetPixelData(0, 0, width - 1, height - 1, 1, data, 0)
         return vtk_to_numpy(data).reshape(height, width, 3)[::-1]
 
-    def depth(self, every: int = 1) -> np.ndarray:
-        """Distance (height, width) float32 [m] along the camera's axis at the middle of every so many pixels.
-
-        It is infinite where nothing was drawn.
-        """
+    def depth(self) -> np.ndarray:
+        """Distance (height, width) float32 [m] along the camera's axis in each pixel, infinite where nothing is."""
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkCommonCore import vtkFloatArray
 
         width, height = self.size
         data = vtkFloatArray()
         self.plotter.ren_win.GetZbufferData(0, 0, width - 1, height - 1, data)
-        z = vtk_to_numpy(data).reshape(height, width)[::-1][every // 2 :: every, every // 2 :: every]
-        near, far = self.plotter.camera.clipping_range
-        if self.plotter.camera.parallel_projection:
-            return np.where(z < 1, near + z * (far - near), np.inf).astype(np.float32)
-        return np.where(z < 1, near * far / (far - z * (far - near)), np.inf).astype(np.float32)
+        depth = vtk_to_numpy(data).reshape(height, width)[::-1]
+        _to_metres(depth, *self.plotter.camera.clipping_range, bool(self.plotter.camera.parallel_projection))
+        return depth
 
     def close(self) -> None:
         self.plotter.close()
@@ -122,6 +119,16 @@ def _pyvista() -> Any:
     except ImportError as error:
         raise InputError(f"pictures need pyvista: pip install 'pbng[view]' ({error})") from error
     return pyvista
+
+
+@kernel
+def _to_metres(depth, near, far, parallel):
+    """Make distances [m] of the renderer's depths (h, w), from 0 at ``near`` [m] to 1 at ``far``, in place."""
+    for i in prange(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            z = depth[i, j]
+            metres = near + z * (far - near) if parallel else near * far / (far - z * (far - near))
+            depth[i, j] = metres if z < 1 else np.inf
 
 
 @contextmanager
