@@ -56,6 +56,8 @@ def _surfaces(bodies: Sequence[Body], rule: ContactRule) -> Surfaces:
     for b in {*chosen, *own}:
         if not has_surface(b):
             raise InputError(f"contact: body {b.name!r} has no surface: it is plane; contact is for solids and cloth")
+        if b.is_cloth and rule.thickness == 0:
+            raise InputError(f"contact: thickness must be positive for body {b.name!r}: cloth has no inside")
     if len(set(chosen)) == 1 and not own:
         raise InputError(
             f"contact: body {chosen[0].name!r} is alone, and does not collide with itself; self_collision=True, or"
