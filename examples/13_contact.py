@@ -48,10 +48,10 @@ def slide(friction=0.2, degrees=20.0):
 
 
 def main(folder=None):
-    """Returns what is left of the momentum times the block's acceleration over Coulomb's: one."""
+    """Returns what is left of the momentum or the block's acceleration over Coulomb's: the one farther from one."""
     kept, slid = collide(), slide()
     print(f"momentum: {kept:.6f} of it kept; acceleration on the slope: {slid:.4f} of Coulomb's")
-    return kept * slid
+    return max(kept, slid, key=lambda ratio: abs(ratio - 1))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 import pbng
-from pbng.bench import accuracy, app, cycles, frames, poses
+from pbng.bench import accuracy, app, cloth, cycles, frames, poses
+from pbng.cli import app as commands
 
 LEVELS = ("1e-02", "1e-03", "1e-04", "1e-06")
 
@@ -131,6 +132,67 @@ def test_commands_print_and_record(tmp_path):
     assert result.exit_code == 0, result.output
     assert "two-grid" in result.output
     assert len(json.loads((tmp_path / "accuracy.json").read_text())["rows"]) == 7
+
+
+def test_cloth_is_a_command_like_the_others(tmp_path):
+    record = tmp_path / "new" / "cloth.json"
+    command = f"bench cloth --n 6 --held rim --seconds 2 --record {record}"
+    result = CliRunner().invoke(commands, command.split(), catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    written = json.loads(record.read_text())
+    assert written["benchmark"] == "cloth"
+    assert {r["held"] for r in written["rows"]} == {"rim"}
+    for k, _ in enumerate(cloth.CLOTHS):
+        rows = {r["method"]: r for r in written["rows"][3 * k : 3 * k + 3]}
+        assert list(rows) == ["cycles", "Newton", "sweeps"]
+        assert {r["status"] for r in rows.values()} == {"CONVERGED"}
+        for r in rows.values():
+            needed = [r[level] for level in LEVELS]
+            assert needed == sorted(needed)
+            assert r["s 1e-06"] > 0
+            assert r["last"] <= 1e-6
+            assert r["energy"] == pytest.approx(rows["Newton"]["energy"], rel=1e-6)
+        assert rows["cycles"]["1e-06"] < rows["sweeps"]["1e-06"]
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "said"),
+    [
+        ("sweep --model foo", 1, "no model 'foo' to measure; there are corotated, neo-hookean"),
+        ("convergence --model corotated --model foo", 1, "no model 'foo'"),
+        ("accuracy --model foo", 1, "no model 'foo'"),
+        ("cycles --model foo", 1, "no model 'foo'"),
+        ("poses --model foo", 1, "no model 'foo'"),
+        ("cloth --held foo", 1, "no sheet is held by 'foo'"),
+        ("sweep --dtype float16", 2, "'float16' is not one of"),
+        ("cycles --dtype float16", 2, "'float16' is not one of"),
+        ("sweep --rounds 0", 2, "--rounds"),
+        ("contact --rounds 0", 2, "--rounds"),
+        ("convergence --sweeps 0", 2, "--sweeps"),
+        ("convergence --every 0", 2, "--every"),
+        ("cycles --n 2", 2, "--n"),
+        ("poses --seed -1", 2, "--seed"),
+        ("sweep --threads 0", 2, "--threads"),
+        ("sweep --threads 4096", 1, "threads must lie between"),
+        ("contact --threads 4096", 1, "threads must lie between"),
+        ("sweep --n 3 --threads 1 --rounds 1 --delaunay 1", 1, "at least 2 vertices along an edge, not 1"),
+        ("cycles --record .", 2, "--record"),
+    ],
+)
+def test_commands_refuse_what_they_cannot_use(command, code, said):
+    """In a line, before any work, and without a traceback."""
+    result = CliRunner().invoke(commands, ["bench", *command.split()])
+    assert isinstance(result.exception, SystemExit)
+    assert result.exit_code == code
+    assert said in " ".join(result.output.split())
+
+
+def test_models_are_told_by_name():
+    from pbng.bench.scenes import MODELS, model_of
+
+    assert [model_of(name) for name in MODELS] == list(MODELS.values())
+    with pytest.raises(pbng.InputError, match="no model 'foo' to measure; there are corotated"):
+        poses.measure(1, 3, 1e-3, "foo")
 
 
 def test_a_cycle_a_frame_beats_sweeps():

@@ -49,6 +49,38 @@ def test_resolution_too_low_is_named(name, resolution):
         SCENES[name](resolution=resolution)
 
 
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("resolution", ["8", 2.5, None])
+def test_resolution_of_another_kind_is_named(name, resolution):
+    with pytest.raises(pbng.InputError, match=f"not .*{resolution}"):
+        SCENES[name](resolution=resolution)
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "values"),
+    [
+        ("armadillos", "surface", (5, [1, 2])),
+        ("bent_surface", "surface", (5, [1, 2])),
+        ("armadillos", "bodies", (0, "2", 1.5)),
+        ("armadillos", "cloth", (1, "8")),
+        ("armadillos", "free_at", (-1.0, math.inf, "soon")),
+        ("dropping_shapes", "shapes", (0, "3")),
+        ("hanging_cloth", "k_bend", (-1.0, "stiff")),
+    ],
+)
+def test_options_of_a_scene_are_named(name, option, values):
+    for wrong in values:
+        with pytest.raises(pbng.InputError, match=f"{name}: {option} must be"):
+            SCENES[name](**{option: wrong})
+
+
+def test_cloth_keeps_a_quarter_of_the_distance_of_its_vertices():
+    from pbng.gallery import cloth
+
+    assert cloth._thickness(1.0, 51) == pytest.approx(0.25 * 0.02)
+    assert cloth._thickness(1.0, 6) == 0.01
+
+
 def test_block_without_free_vertices_runs():
     recipe = find("twisting_block")(resolution=2)
     assert pbng.solve(recipe.scene, recipe.solver, recipe.budget).status is pbng.Status.CONVERGED
@@ -121,9 +153,21 @@ def test_eased_motion_begins_and_ends_where_the_motion_does():
 
 def test_recipe_refuses_what_it_cannot_run():
     scene = pbng.Scene()
-    for wrong in ({"scene": 3}, {"frames": 0}, {"fps": 0.0}):
-        with pytest.raises(pbng.InputError, match=next(iter(wrong))):
-            Recipe(**{"scene": scene, **wrong})
+    for name, values in {
+        "scene": (3,),
+        "frames": (0, 2.5, "3"),
+        "fps": (0.0, math.inf, math.nan, "fast"),
+        "substeps": (0, -3, 2.5, "2"),
+        "dt": (0.0, -1.0, math.nan),
+        "solver": (3, pbng.PBNG),
+        "budget": (3, None),
+    }.items():
+        for wrong in values:
+            with pytest.raises(pbng.InputError, match=f"Recipe: {name} must be"):
+                Recipe(**{"scene": scene, name: wrong})
+    with pytest.raises(pbng.InputError, match="dt or substeps, not both"):
+        Recipe(scene, inertia=True, dt=0.01, substeps=2)
+    assert Recipe(scene, frames=np.int64(3), fps=24, dt=0.01).fps == 24.0
 
 
 def test_unknown_scene_names_its_neighbours():

@@ -9,17 +9,20 @@ import pbng
 from pbng.gallery import contact, falling, find, solids
 
 BODY = pbng.shapes.beam(1.0, 0.4, 3)
-# Options, frames of the run, and frames that are run a second time: past the first contacts.
+# Options; frames that are run a second time, past the first contacts; and how long an edge may be at any time, over its
+# length at rest: as measured, and a little more. The cloth of Fig. 19 is heavy beside its stiffness.
 RUNS = {
-    "two_blocks_colliding": ({"resolution": 4}, 74, 16),
-    "squeezed_ball": ({"resolution": 6}, 61, 14),
-    "dropping_shapes": ({"resolution": 4, "shapes": 7}, 43, 12),
-    "armadillos": ({"surface": BODY, "bodies": 2, "cloth": 12, "free_at": 0.7}, 38, 18),
-    "cloth_on_sphere": ({"resolution": 14}, 121, 14),
-    "hanging_cloth": ({"resolution": 6}, 31, 4),
-    "twisted_cloth": ({"resolution": 8}, 106, 40),
+    "two_blocks_colliding": ({"resolution": 4}, 16, 1.3),
+    "squeezed_ball": ({"resolution": 6}, 14, 1.5),
+    "dropping_shapes": ({"resolution": 4, "shapes": 6}, 12, 1.5),
+    "armadillos": ({"surface": BODY, "bodies": 2, "cloth": 12, "free_at": 0.7}, 18, 1.7),
+    "cloth_on_sphere": ({"resolution": 14}, 14, 1.1),
+    "hanging_cloth": ({"resolution": 6}, 4, 3.0),
+    "twisted_cloth": ({"resolution": 8}, 40, 1.3),
 }
 FALLING = "dropping_shapes", "armadillos", "cloth_on_sphere", "hanging_cloth"
+DRIVEN = "two_blocks_colliding", "twisted_cloth"
+SOLID = "two_blocks_colliding", "squeezed_ball", "dropping_shapes", "armadillos"
 TOUCHING = [name for name in RUNS if name != "hanging_cloth"]
 
 
@@ -31,7 +34,7 @@ def made(name):
 def frames(name, again=False):
     recipe = made(name)
     motion = {"inertia": recipe.inertia, "dt": recipe.dt, "substeps": recipe.substeps}
-    n = RUNS[name][2 if again else 1]
+    n = RUNS[name][1] if again else recipe.frames
     return list(pbng.simulate(recipe.scene, recipe.solver, recipe.budget, frames=n, fps=recipe.fps, **motion))
 
 
@@ -45,15 +48,44 @@ def thickness(name):
     return 2 * frames(name)[0].problem.contact.surfaces.skin[0]
 
 
+def longest(name):
+    """The longest edge of any body in each frame, over its length at rest, (frames,)."""
+    ratios = []
+    for k, part in enumerate(frames(name)[0].problem.bodies):
+        i, j = part.mesh.edges.T
+        length = np.linalg.norm(body(name, k)[:, i] - body(name, k)[:, j], axis=2)
+        ratios.append((length / np.linalg.norm(part.mesh.X[i] - part.mesh.X[j], axis=1)).max(1))
+    return np.max(ratios, axis=0)
+
+
 @pytest.mark.parametrize("name", RUNS)
 def test_runs_to_the_end(name):
+    """All frames come, which they do not where a state is lost; nothing is overstretched, and something happens."""
     run, recipe = frames(name), made(name)
-    assert len(run) == RUNS[name][1] <= recipe.frames
+    assert [f.index for f in run] == list(range(recipe.frames))
+    assert run[-1].t == pytest.approx((recipe.frames - 1) / recipe.fps)
+    assert all(f.result.status.ok for f in run)
     assert recipe.scene.name == name
-    assert all(np.isfinite(f.x).all() for f in run)
+    assert longest(name).max() < RUNS[name][2]
+    assert max(np.abs(f.x - run[0].x).max() for f in run) > 0.15 * np.ptp(run[0].x, axis=0).max()
+
+
+@pytest.mark.parametrize("name", SOLID)
+def test_no_tet_stays_inverted(name):
+    run = frames(name)
+    tets = sum(len(g.cells) for g in run[0].problem.groups if g.kind.name == "tet")
     assert run[-1].result.inverted == 0
-    assert max(f.result.inverted for f in run) <= 0.01 * run[0].problem.n_elem
-    assert np.abs(run[-1].x - run[0].x).max() > 0 if name != "squeezed_ball" else True
+    assert max(f.result.inverted for f in run) <= 0.01 * tets
+
+
+@pytest.mark.parametrize("name", DRIVEN)
+def test_what_is_driven_is_not_thrown_and_comes_to_rest(name):
+    """Its kinetic energy is at most twice what it would be if all of it moved as fast as what is driven ever does."""
+    run = frames(name)
+    problem, kinetic = run[0].problem, np.array([f.kinetic_energy for f in run])
+    fastest = max(np.linalg.norm(f.v[problem.fixed], axis=1).max() for f in run)
+    assert kinetic.max() < 2 * 0.5 * problem.mass.sum() * fastest**2
+    assert kinetic[-1] < 0.2 * kinetic.max()
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -172,8 +204,6 @@ def test_armadillos_are_little_dragons_or_from_a_file(tmp_path):
     file = tmp_path / "nothing.obj"
     with pytest.raises(pbng.InputError, match=r"nothing\.obj"):
         find("armadillos")(surface=file)
-    with pytest.raises(pbng.InputError, match="at least one body"):
-        find("armadillos")(bodies=0)
 
 
 def test_cloth_stays_out_of_the_ball_and_comes_to_rest():

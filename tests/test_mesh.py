@@ -20,11 +20,11 @@ TWO = [[0, 1, 2, 3], [1, 2, 3, 4]]
         (CORNERS[:4], [[0, 1, 2, 3.0]], "cells must be integers, not float64"),
         (CORNERS[:4], [[0, 1, 2, 4]], r"tet 0 = \[0, 1, 2, 4\] names a vertex outside 0 \.\. 3 \(1 such tets\)"),
         (CORNERS[:4], [[0, 1, 2, -1]], r"names a vertex outside 0 \.\. 3"),
-        (CORNERS, [[0, 1, 2, 3]], "vertex 4 belong to no tet; remove them"),
+        (CORNERS, [[0, 1, 2, 3]], "vertex 4 belongs to no tet; remove it"),
         (CORNERS[:, :1], TWO, r"X must have shape \(n_vert, 3\), not \(5, 1\)"),
-        (CORNERS * [1, 1, np.nan], TWO, r"vertices 0, 1, 2, 3, 4 not finite: X\[0\] = \[0\.0, 0\.0, nan\]"),
+        (CORNERS * [1, 1, np.nan], TWO, r"vertices 0, 1, 2, 3, 4 are not finite: X\[0\] = \[0\.0, 0\.0, nan\]"),
         (CORNERS * [1, 1, 0], TWO, "tets 0, 1 have zero volume"),
-        (CORNERS, [[0, 1, 2, 3], [1, 2, 4, 4]], "tet 1 have zero volume"),
+        (CORNERS, [[0, 1, 2, 3], [1, 2, 4, 4]], "tet 1 has zero volume"),
         (CORNERS, [[0, 1, 2, 3], [1, 2, 3, 4], [4, 3, 2, 1]], r"tets 1 and 2 have the same vertices \[1, 2, 3, 4\]"),
     ],
 )
@@ -64,8 +64,8 @@ def test_flipped_tets_are_corrected_and_reported(caplog):
     ("X", "cells", "word"),
     [
         (CORNERS[:3], [[0, 1, 3]], r"triangle 0 = \[0, 1, 3\] names a vertex outside"),
-        (CORNERS[:3], [[0, 1, 1]], "vertex 2 belong to no triangle"),
-        (CORNERS[[0, 1, 1]] * [1, 2, 3], [[0, 1, 2]], "triangle 0 have zero area"),
+        (CORNERS[:3], [[0, 1, 1]], "vertex 2 belongs to no triangle"),
+        (CORNERS[[0, 1, 1]] * [1, 2, 3], [[0, 1, 2]], "triangle 0 has zero area"),
         (CORNERS[:3], [[0, 1, 2], [2, 0, 1]], "triangles 0 and 1 have the same vertices"),
     ],
 )

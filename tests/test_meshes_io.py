@@ -233,12 +233,12 @@ def test_bad_meshes_say_what_is_wrong(tmp_path, suffix):
         assert str(raised.value).startswith(f"{path}: ")
 
     refuses("only triangles.*read_surface.*tetrahedralize", X, triangle=[[0, 1, 2]])
-    refuses("tet 0 have zero volume", X * [1, 1, 0], tetra=[[0, 1, 2, 4]])
+    refuses("tet 0 has zero volume", X * [1, 1, 0], tetra=[[0, 1, 2, 4]])
     refuses("face .* more than two|same side", X, tetra=[[0, 1, 2, 3], [0, 1, 2, 4]])
     if suffix != ".npz":
         refuses("cells other than tets: hexahedron", np.ones((8, 3)), hexahedron=[list(range(8))])
     if suffix != ".mesh":  # which meshio writes, but does not read
-        refuses("vertex 2 not finite", np.where(np.arange(5)[:, None] == 2, np.nan, X), tetra=[[0, 1, 2, 3]])
+        refuses("vertex 2 is not finite", np.where(np.arange(5)[:, None] == 2, np.nan, X), tetra=[[0, 1, 2, 3]])
 
 
 def test_arrays_that_are_no_mesh(tmp_path):

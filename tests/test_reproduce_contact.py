@@ -2,14 +2,17 @@
 
 import json
 import re
+from dataclasses import replace
 
 import matplotlib.image
 import numpy as np
 import pytest
 
 from pbng import reproduce
+from pbng.reproduce import contact
 from pbng.reproduce.contact import PAPER, fall
 from pbng.reproduce.section import Settings
+from pbng.solvers.base import Status
 
 NAMES = ("fig13", "fig14", "fig16", "table3")
 FEW = {"fig13": 76, "fig14": 16, "fig16": 31}
@@ -18,8 +21,6 @@ FEW = {"fig13": 76, "fig14": 16, "fig16": 31}
 @pytest.fixture(scope="module")
 def section(tmp_path_factory):
     """Runs an experiment, smaller than small, once."""
-    from pbng.reproduce import contact
-
     tiny = {
         "fig13": ({"resolution": 4}, FEW["fig13"]),
         "fig14": ({"resolution": 4, "shapes": 5}, FEW["fig14"]),
@@ -109,3 +110,49 @@ def test_runs_are_shared(section, tmp_path):
     section("fig14")
     settings = Settings(tmp_path, "small", threads=1)
     assert fall("fig14", settings) is fall("fig14", settings)
+
+
+def cut(run, frames, lost=False):
+    """A run that ends after so many frames, the one at time 0 not counted; lost there, if so."""
+    arrays = ("seconds", "iterations", "finding", "packing", "pairs", "walls", "deepest", "kinetic", "potential")
+    last = run.frames[-1]
+    if lost:
+        last = replace(last, result=replace(last.result, status=Status.DIVERGED))
+    short = {name: getattr(run, name)[:frames] for name in (*arrays, "inverted")}
+    return replace(run, frames=(*run.frames[:-1], last), **short)
+
+
+def test_frames_are_called_sound_only_if_they_are(section, tmp_path):
+    """Not where tets are inverted or penetration shows, though the state is never lost."""
+    section("fig14")
+    settings = Settings(tmp_path, "small", threads=1)
+    run = fall("fig14", settings)
+    zeros = np.zeros(len(run.seconds))
+    good = replace(run, inverted=zeros, deepest=zeros)
+    inverted = replace(good, inverted=np.where(np.arange(len(zeros)) == 3, 132, 0))
+    deep = replace(good, deepest=np.full(len(zeros), 1.8 * run.edge))
+    told = [contact._robust(r, settings, "fig14") for r in (good, inverted, deep, cut(good, 9, lost=True))]
+    assert told[0].startswith("All frames are sound:")
+    assert "which does not show" in told[0]
+    assert told[1].startswith("It runs on without being lost, but not every frame is sound:")
+    assert "132 tets at most are inverted" in told[1]
+    assert told[2].startswith("It runs on without being lost, but not every frame is sound:")
+    assert "1.8 of an edge, which shows" in told[2]
+    assert told[3].startswith("The state is lost after 0.30 s:")
+
+
+def test_energies_are_compared_at_one_moment_of_both_runs(section, tmp_path):
+    """That is the end of the rest, or the last frame of the run that is shorter; and it is named."""
+    section("fig13")
+    run = fall("fig13", Settings(tmp_path, "small", threads=1))
+    kinetic = np.arange(1.0, len(run.seconds) + 1)  # number of the frame
+    ours, stiff = replace(run, kinetic=kinetic), replace(run, kinetic=1000 + kinetic)
+    (row,) = [r for r in contact._stiff_rows(ours, stiff) if "energy" in r.what]
+    assert row.remark == "45 J with ours, at 1.50 s"  # where the ends are still held
+    assert "what ought to be at rest moves, with 1e+03 J where ours has 45 J" in contact._collided(ours, stiff)
+    for frames in (9, 20):  # before the blocks have come together
+        (row,) = contact._stiff_rows(ours, cut(stiff, frames, lost=True))
+        assert row.ours == f"{frames / 30:.2f} s"
+        assert row.remark == f"the kinetic energy is 1e+03 J at {frames / 30:.2f} s, {frames} J with ours"
+        assert f"lost after {frames / 30:.2f} s" in contact._collided(ours, cut(stiff, frames, lost=True))
+    assert "ought to be at rest" not in contact._collided(cut(ours, 20), cut(stiff, 20))

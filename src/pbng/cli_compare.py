@@ -5,9 +5,8 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,9 +23,7 @@ from pbng.compare.contest import contest
 from pbng.compare.start import scattered
 from pbng.errors import InputError
 from pbng.io.store import put
-from pbng.problem import Problem
 from pbng.solvers.base import Budget, Solver
-from pbng.solvers.xpbd import XPBD
 
 USUAL = ("pbng", "multigrid", "newton", "xpbd")
 SECONDS = 4.0  # for each method, if nothing is said
@@ -77,11 +74,10 @@ def compare(
     with blaming(file):
         problem = recipe.scene.compile()
         start = scattered(problem, seed) if hard else None
-        solvers = able(problem, solvers, strict=methods is not None)
         with new_folder(to or Path("comparisons") / name, overwrite) as folder:
             if record is not None:
                 record.parent.mkdir(parents=True, exist_ok=True)  # found out before the work, not after
-            with _progress(list(solvers)) as monitor:
+            with _progress() as monitor:
                 found = contest(
                     problem,
                     solvers,
@@ -91,6 +87,7 @@ def compare(
                     at=at,
                     rounds=rounds,
                     monitor=monitor,
+                    leave_out=_left_out if methods is None else None,
                 )
             show(found)
             text = json.dumps(found.record(seed if hard else None), indent=1, allow_nan=False).encode()
@@ -134,17 +131,8 @@ def _words(text: str) -> list[str]:
     return words
 
 
-def able(problem: Problem, solvers: Mapping[str, Solver], strict: bool) -> dict[str, Solver]:
-    """The solvers that can do a problem: all, if ``strict``, and else without XPBD where it cannot, which is said."""
-    able = dict(solvers)
-    for label, solver in solvers.items():
-        if not strict and isinstance(solver, XPBD):  # of the usual ones the only one that asks something of a scene
-            try:
-                solver.set_up(replace(problem))
-            except InputError as error:
-                err.print(f"[yellow]left out[/] {escape(label)}: {escape(str(error))}", soft_wrap=True)
-                del able[label]
-    return able
+def _left_out(label: str, why: str) -> None:
+    err.print(f"[yellow]left out[/] {escape(label)}: {escape(why)}", soft_wrap=True)
 
 
 def show(found: Comparison) -> None:
@@ -230,7 +218,7 @@ def _draw(found: Comparison, folder: Path) -> None:
 
 
 @contextmanager
-def _progress(labels: list[str]) -> Iterator[Callable[[str, float], Any] | None]:
+def _progress() -> Iterator[Callable[[str, float], Any] | None]:
     """Bars for a person, nothing in a pipe."""
     if not err.is_terminal:
         yield None
@@ -238,12 +226,12 @@ def _progress(labels: list[str]) -> Iterator[Callable[[str, float], Any] | None]
     columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(24), TimeElapsedColumn()
     with Progress(*columns, console=err, transient=True) as bars:
         tasks = {"reference": bars.add_task("reference", total=None)}
-        tasks |= {label: bars.add_task(label, total=1.0, start=False) for label in labels}
 
         def told(label: str, share: float) -> None:
             if label != "reference":
                 bars.update(tasks["reference"], total=1.0, completed=1.0)
-                bars.start_task(tasks[label])
+                if label not in tasks:  # who comes is known when the first has begun: some may be left out
+                    tasks[label] = bars.add_task(label, total=1.0)
                 bars.update(tasks[label], completed=share)
 
         yield told

@@ -70,7 +70,8 @@ class Mesh:
         used[cells] = True
         if not used.all():
             loose = np.flatnonzero(~used)
-            raise InputError(f"{_named('vertex', loose)} belong to no {self.cell_name}; remove them")
+            none = f"to no {self.cell_name}; remove"
+            raise InputError(_blamed("vertex", loose, f"belongs {none} it", f"belong {none} them"))
         return cells
 
     def _oriented(self, X: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +79,7 @@ class Mesh:
 
     def _degenerate(self, bad: np.ndarray, what: str) -> None:
         if bad.any():
-            raise InputError(f"{_named(self.cell_name, np.flatnonzero(bad))} {what}")
+            raise InputError(_blamed(self.cell_name, np.flatnonzero(bad), f"has zero {what}", f"have zero {what}"))
 
     @staticmethod
     def _grouped(groups: Mapping[str, Any], n: int, what: str) -> dict[str, np.ndarray]:
@@ -210,7 +211,7 @@ class TetMesh(Mesh):
 
     def _oriented(self, X: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         volume, longest = _measure_tets(X, cells)
-        self._degenerate(np.abs(volume) <= 1e-12 * longest**3, "have zero volume")
+        self._degenerate(np.abs(volume) <= 1e-12 * longest**3, "volume")
         flipped = np.flatnonzero(volume < 0)
         cells[flipped] = cells[flipped][:, [0, 1, 3, 2]]
         surface, (code, i, j) = tet_faces(cells, len(X))
@@ -263,7 +264,7 @@ class TriMesh(Mesh):
         area = triangle_areas(X, cells)
         edge = X[cells[:, TRIANGLE_EDGES[:, 1]]] - X[cells[:, TRIANGLE_EDGES[:, 0]]]
         longest2 = np.einsum("eij,eij->ei", edge, edge).max(1)
-        self._degenerate(np.linalg.norm(area, axis=1) <= 1e-12 * longest2, "have zero area")
+        self._degenerate(np.linalg.norm(area, axis=1) <= 1e-12 * longest2, "area")
         first, again = _repeated(cells)
         if len(again):
             raise InputError(f"triangles {first[0]} and {again[0]} have the same vertices")
@@ -354,7 +355,8 @@ def _positions(X: Any) -> np.ndarray:
         raise InputError(f"X must have shape (n_vert, 3), not {X.shape}")
     bad = np.flatnonzero(~np.isfinite(X).all(1))
     if len(bad):
-        raise InputError(f"{_named('vertex', bad)} not finite: X[{bad[0]}] = {X[bad[0]].tolist()}")
+        what = f"not finite: X[{bad[0]}] = {X[bad[0]].tolist()}"
+        raise InputError(_blamed("vertex", bad, f"is {what}", f"are {what}"))
     return X
 
 
@@ -366,13 +368,13 @@ def _repeated(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order[:-1][same], order[1:][same]
 
 
-def _named(what: str, index: np.ndarray) -> str:
-    """``tet 7`` or ``tets 7, 9, 12, ... (40 in all)``."""
-    plural = {"vertex": "vertices"}.get(what, what + "s")
+def _blamed(what: str, index: np.ndarray, one: str, many: str) -> str:
+    """``tet 7`` and what ``one`` does, or ``tets 7, 9, 12, ... (40 in all)`` and what ``many`` do."""
     if len(index) == 1:
-        return f"{what} {index[0]}"
-    shown = ", ".join(str(i) for i in index[:5])
-    return f"{plural} {shown}" + (f", ... ({len(index)} in all)" if len(index) > 5 else "")
+        return f"{what} {index[0]} {one}"
+    plural = {"vertex": "vertices"}.get(what, what + "s")
+    shown = ", ".join(str(i) for i in index[:5]) + (f", ... ({len(index)} in all)" if len(index) > 5 else "")
+    return f"{plural} {shown} {many}"
 
 
 def _frozen(a: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from pbng.bench.scenes import MODELS, box, hard_start
+from pbng.bench.scenes import box, hard_start, model_of
 from pbng.compare.comparison import ERRORS, RATIOS, Comparison
 from pbng.compare.contest import Curve, contest
 from pbng.compare.reference import converged
@@ -41,7 +41,7 @@ def measure(n: int, model: str, nu: float, seconds: float, threads: int | None) 
     Raises:
         InputError: The equilibrium that errors are distances from was not found.
     """
-    problem = hard_start(box(n), MODELS[model](E=1e5, nu=nu, density=10.0))
+    problem = hard_start(box(n), model_of(model)(E=1e5, nu=nu, density=10.0))
     reference = converged(problem, Start.of(problem), threads)
     if not reference.certain:
         raise InputError(f"the reference is no equilibrium: {reference}")

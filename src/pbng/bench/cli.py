@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,21 +14,75 @@ from rich.console import Console
 from rich.table import Table
 
 app = typer.Typer(
-    help="Measure: time of a sweep, convergence, accuracy, cycles, poses, frames, contact.", no_args_is_help=True
+    help="Measure: time of a sweep, convergence, accuracy, cycles, poses, frames, contact, cloth.", no_args_is_help=True
 )
 console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 170)  # tables are wide
 
 
+def _known(models: Any) -> Any:
+    """One model or several, all of them known: found out before the work, not in the midst of it."""
+    from pbng.bench.scenes import model_of
+
+    for name in [models] if isinstance(models, str) else models:
+        model_of(name)
+    return models
+
+
+def _held(names: list[str] | None) -> list[str] | None:
+    from pbng.bench.cloth import check_held
+
+    for name in names or ():
+        check_held(name)
+    return names
+
+
+def _writable(path: Path | None) -> Path | None:
+    """A file that can be written, its folder made if need be: found out before the work, not after."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+class Real(StrEnum):
+    """Precisions that there are kernels for."""
+
+    FLOAT32 = "float32"
+    FLOAT64 = "float64"
+
+
+_MODEL = typer.Option("--model", help="Model to measure.", callback=_known)
+_SIZE = typer.Option("--n", help="Vertices along an edge of the block.", min=3)  # of 2 none is free
+_THREADS = typer.Option("--threads", help="Number of threads.", min=1)
+Model = Annotated[str, _MODEL]
+Models = Annotated[list[str], _MODEL]
+Size = Annotated[int, _SIZE]
+Sizes = Annotated[list[int], _SIZE]
+Threads = Annotated[int, _THREADS]
+Numbers = Annotated[list[int], _THREADS]
+Rounds = Annotated[int, typer.Option("--rounds", help="Times are medians over so many rounds.", min=1)]
+Ratio = Annotated[float, typer.Option("--nu", help="Poisson's ratio.")]
+Ratios = Annotated[list[float], typer.Option("--nu", help="Poisson's ratios.")]
+Precision = Annotated[Real, typer.Option("--dtype", help="Precision of the sweeps.")]
+Seed = Annotated[int, typer.Option("--seed", help="Of what is random.", min=0)]
+Folder = Annotated[Path | None, typer.Option("--out", help="Folder for figures.", file_okay=False)]
+Record = Annotated[
+    Path | None,
+    typer.Option("--record", help="Write the figures to this JSON file.", dir_okay=False, callback=_writable),
+]
+
+
 @app.command("sweep")
 def sweep_command(
-    n: Annotated[list[int], typer.Option("--n", help="Vertices along an edge of the block.")] = [32, 64],  # noqa: B006
-    delaunay: Annotated[int, typer.Option(help="Vertices along an edge of the random-order mesh; 0 for none.")] = 33,
-    model: Annotated[list[str], typer.Option(help="Models to measure.")] = ["corotated", "neo-hookean"],  # noqa: B006
-    threads: Annotated[list[int], typer.Option(help="Numbers of threads.")] = [1, 2],  # noqa: B006
-    dtype: str = "float32",
-    rounds: int = 15,
+    n: Sizes = [32, 64],  # noqa: B006
+    delaunay: Annotated[
+        int, typer.Option(help="Vertices along an edge of the random-order mesh; 0 for none.", min=0)
+    ] = 33,
+    model: Models = ["corotated", "neo-hookean"],  # noqa: B006
+    threads: Numbers = [1, 2],  # noqa: B006
+    dtype: Precision = Real.FLOAT32,
+    rounds: Rounds = 15,
     reference: Annotated[Path | None, typer.Option(help="Folder of an implementation to compare with.")] = None,
-    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+    record: Record = None,
 ) -> None:
     """Time a sweep of PBNG, in one run with a reference implementation if one is given."""
     from pbng.bench import sweep
@@ -58,18 +113,18 @@ def sweep_command(
 
 @app.command("convergence")
 def convergence_command(
-    n: Annotated[list[int], typer.Option("--n", help="Vertices along an edge of the block.")] = [32],  # noqa: B006
-    model: Annotated[list[str], typer.Option(help="Models to measure.")] = [  # noqa: B006
+    n: Sizes = [32],  # noqa: B006
+    model: Models = [  # noqa: B006
         "corotated",
         "neo-hookean",
         "stable-neo-hookean",
     ],
-    nu: Annotated[list[float], typer.Option(help="Poisson's ratios.")] = [0.3],  # noqa: B006
-    sweeps: int = 200,
-    every: int = 10,
-    dtype: str = "float64",
-    out: Annotated[Path | None, typer.Option(help="Folder for plots.")] = None,
-    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+    nu: Ratios = [0.3],  # noqa: B006
+    sweeps: Annotated[int, typer.Option(help="Sweeps of each.", min=1)] = 200,
+    every: Annotated[int, typer.Option(help="Sweeps between looks at the residual.", min=1)] = 10,
+    dtype: Precision = Real.FLOAT64,
+    out: Folder = None,
+    record: Record = None,
 ) -> None:
     """Residual against sweeps: a block turned by 90° and stretched by half in one step, from rest."""
     from pbng.bench import convergence
@@ -109,13 +164,13 @@ def convergence_command(
 
 @app.command("accuracy")
 def accuracy_command(
-    n: Annotated[int, typer.Option("--n", help="Vertices along an edge of the block.")] = 32,
-    model: Annotated[str, typer.Option(help="Model to measure.")] = "corotated",
-    nu: Annotated[float, typer.Option(help="Poisson's ratio.")] = 0.3,
+    n: Size = 32,
+    model: Model = "corotated",
+    nu: Ratio = 0.3,
     seconds: Annotated[float, typer.Option(help="Seconds of solving by each method.", min=0.001)] = 4.0,
-    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
-    out: Annotated[Path | None, typer.Option(help="Folder for the figure.")] = None,
-    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+    threads: Threads = 2,
+    out: Folder = None,
+    record: Record = None,
 ) -> None:
     """Residual and true position error against seconds, by method: the block of ``convergence``."""
     from pbng.bench import accuracy
@@ -144,16 +199,16 @@ def accuracy_command(
 
 @app.command("cycles")
 def cycles_command(
-    n: Annotated[list[int], typer.Option("--n", help="Vertices along an edge of the block.")] = [16, 32, 64],  # noqa: B006
-    model: Annotated[list[str], typer.Option(help="Models to measure.")] = [  # noqa: B006
+    n: Sizes = [16, 32, 64],  # noqa: B006
+    model: Models = [  # noqa: B006
         "corotated",
         "neo-hookean",
         "stable-neo-hookean",
     ],
-    nu: Annotated[list[float], typer.Option(help="Poisson's ratios.")] = [0.3, 0.45, 0.49],  # noqa: B006
-    dtype: str = "float32",
-    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
-    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+    nu: Ratios = [0.3, 0.45, 0.49],  # noqa: B006
+    dtype: Precision = Real.FLOAT32,
+    threads: Threads = 2,
+    record: Record = None,
 ) -> None:
     """Cycles of the two-grid method to a residual ratio: the block of ``convergence``."""
     from pbng.bench import cycles
@@ -179,11 +234,11 @@ def cycles_command(
 
 @app.command("frames")
 def frames_command(
-    n: Annotated[int, typer.Option("--n", help="Vertices along an edge of the block.")] = 32,
+    n: Size = 32,
     frames: Annotated[int, typer.Option(help="Frames of the twisting block.", min=2)] = 30,
-    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
-    out: Annotated[Path | None, typer.Option(help="Folder for the figure.")] = None,
-    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+    threads: Threads = 2,
+    out: Folder = None,
+    record: Record = None,
 ) -> None:
     """Frames of the twisting block on small budgets: position error against cost."""
     from pbng.bench import frames as bench
@@ -216,14 +271,14 @@ def frames_command(
 @app.command("poses")
 def poses_command(
     count: Annotated[int, typer.Option(help="Number of random poses.", min=1)] = 100,
-    n: Annotated[int, typer.Option("--n", help="Vertices across the bar.")] = 16,
-    error: Annotated[float, typer.Option(help="Largest position error / length of the bar to ask for.")] = 1e-4,
-    model: Annotated[str, typer.Option(help="Model to measure.")] = "corotated",
-    nu: Annotated[float, typer.Option(help="Poisson's ratio.")] = 0.3,
-    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
-    seed: int = 0,
+    n: Annotated[int, typer.Option("--n", help="Vertices across the bar.", min=3)] = 16,
+    error: Annotated[float, typer.Option(help="Largest position error / length of the bar to ask for.", min=0)] = 1e-4,
+    model: Model = "corotated",
+    nu: Ratio = 0.3,
+    threads: Threads = 2,
+    seed: Seed = 0,
     amount: Annotated[float, typer.Option(help="How wild the poses are; 1 folds elements over in most.")] = 0.5,
-    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+    record: Record = None,
 ) -> None:
     """Random poses of a bar, each solved to a position error: is the estimate to be trusted?"""
     from pbng.bench import poses
@@ -255,10 +310,12 @@ def poses_command(
 def contact_command(
     n: Annotated[int, typer.Option("--n", help="Vertices across the body: 46 for 24,300 triangles.", min=2)] = 46,
     points: Annotated[int, typer.Option(help="Points close to its surface.", min=1)] = 100_000,
-    tets: Annotated[int, typer.Option("--tets", help="Vertices across each of six solid balls; 0 for none.")] = 27,
-    threads: Annotated[list[int], typer.Option(help="Numbers of threads.")] = [1, 2],  # noqa: B006
-    rounds: int = 7,
-    record: Annotated[Path | None, typer.Option(help="Write the figures to this JSON file.")] = None,
+    tets: Annotated[
+        int, typer.Option("--tets", help="Vertices across each of six solid balls; 0 for none.", min=0)
+    ] = 27,
+    threads: Numbers = [1, 2],  # noqa: B006
+    rounds: Rounds = 7,
+    record: Record = None,
 ) -> None:
     """Time trees and closest points for contact, in one run with libigl if it is there."""
     from pbng.bench import contact
@@ -281,6 +338,39 @@ def contact_command(
         rows,
     )
     write(record, "contact", rows)
+
+
+@app.command("cloth")
+def cloth_command(
+    n: Annotated[list[int], typer.Option("--n", help="Vertices along an edge of the sheet.", min=3)] = [16, 32, 64],  # noqa: B006
+    held: Annotated[
+        list[str] | None,
+        typer.Option(help="What holds it: corners, edge, rim or ends; by default each.", callback=_held),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Seconds of solving by each method.", min=0.001)] = 10.0,
+    threads: Threads = 1,
+    record: Record = None,
+) -> None:
+    """Cycles, Newton's steps and sweeps to a residual ratio: sheets let go at once, or drawn out and turned."""
+    from pbng.bench import cloth
+
+    rows = [
+        row
+        for by in held or cloth.HELD
+        for m in n
+        for E, k in cloth.CLOTHS
+        for row in cloth.measure(m, by, E, k, seconds, threads)
+    ]
+    show(
+        f"Iterations and seconds to a residual ratio, {seconds:g} s at most, {threads} threads",
+        [Column("held by", "held"), Column("n", "n"), Column("E [N/m]", "E", "{:g}"), Column("k [N m]", "k", "{:g}")]
+        + [Column("method", "method")]
+        + [Column(f"{level:.0e}", f"{level:.0e}") for level in cloth.LEVELS]
+        + [Column(f"s to {level:.0e}", f"s {level:.0e}", "{:.2f}") for level in cloth.LEVELS]
+        + [Column("last", "last", "{:.1e}"), Column("energy [J]", "energy", "{:.6g}"), Column("status", "status")],
+        rows,
+    )
+    write(record, "cloth", rows)
 
 
 @dataclass(frozen=True)

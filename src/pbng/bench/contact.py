@@ -12,6 +12,7 @@ from pbng.contact.bvh import BoxTree
 from pbng.contact.queries import closest_edges, closest_triangles, containing_tets
 from pbng.contact.rings import neighbourhoods
 from pbng.shapes import sphere
+from pbng.solvers.threads import check_threads
 from pbng.topology import TRIANGLE_EDGES, unique_edges
 
 HEIGHT = 1.8  # of the body [m]
@@ -21,6 +22,8 @@ Row = dict[str, Any]
 
 def measure(n: int, points: int, tets: int, threads: list[int], rounds: int) -> list[Row]:
     """One row a query and number of threads; rates in millions of points (or edges) a second."""
+    for count in threads:
+        check_threads("bench contact", count)
     x, triangles = body(n)
     p = near(x, triangles, points)
     edges = unique_edges(triangles, TRIANGLE_EDGES)

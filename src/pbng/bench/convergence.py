@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from pbng.bench.scenes import MODELS, box, hard_start
+from pbng.bench.scenes import box, hard_start, model_of
 from pbng.drivers import solve
 from pbng.solvers.acceleration import SOR, Anderson, Chebyshev, NodeSOR
 from pbng.solvers.base import Budget, Result
@@ -25,7 +25,7 @@ LEVELS = (1e-2, 1e-3, 1e-4, 1e-6)
 
 def measure(n: int, model: str, nu: float, sweeps: int, every: int, dtype: str) -> dict[str, Result]:
     """Results of every acceleration on the hard start of the block of n³ vertices."""
-    problem = hard_start(box(n), MODELS[model](E=1e5, nu=nu, density=10.0))
+    problem = hard_start(box(n), model_of(model)(E=1e5, nu=nu, density=10.0))
     budget = Budget(iterations=sweeps, every=every)
     return {name: solve(problem, PBNG(acceleration=a, dtype=dtype), budget) for name, a in ACCELERATIONS.items()}
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from pbng.bench.convergence import LEVELS, iterations_to, ratios
-from pbng.bench.scenes import MODELS, box, hard_start
+from pbng.bench.scenes import box, hard_start, model_of
 from pbng.bench.timing import peak_memory
 from pbng.drivers import solve
 from pbng.solvers.base import Budget, Result
@@ -16,7 +16,7 @@ WARM_UP = 4  # cycles before the clock runs
 
 def measure(n: int, model: str, nu: float, dtype: str, threads: int | None) -> dict[str, Any]:
     """A row of the table: the hard start of the block of n³ vertices."""
-    material = MODELS[model](E=1e5, nu=nu, density=10.0)
+    material = model_of(model)(E=1e5, nu=nu, density=10.0)
     solver = MultigridPBNG(dtype=dtype, threads=threads)
     solve(hard_start(box(min(n, 8)), material), solver, Budget(iterations=WARM_UP))  # loads what setting up needs
     problem = hard_start(box(n), material)

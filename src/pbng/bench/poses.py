@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from pbng import shapes
-from pbng.bench.scenes import MODELS
+from pbng.bench.scenes import model_of
 from pbng.materials.base import Material
 from pbng.motions import Motion, Rotate, Translate
 from pbng.problem import Problem
@@ -55,7 +55,7 @@ def measure(
     of it; ``true`` is NaN where the reference did not converge.
     """
     rng = np.random.default_rng(seed)
-    problem = bar(n, MODELS[model](E=1e5, nu=nu, density=10.0), [random_pose(rng, amount) for _ in range(count)])
+    problem = bar(n, model_of(model)(E=1e5, nu=nu, density=10.0), [random_pose(rng, amount) for _ in range(count)])
     bound = error * SIZE[0]
     method = MultigridPBNG(threads=threads).set_up(problem)
     exact = MultigridPBNG(dtype="float64", start="previous", threads=threads).set_up(problem)

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from pbng import shapes
+from pbng.errors import InputError
 from pbng.materials.base import Material
 from pbng.materials.corotated import Corotated
 from pbng.materials.neo_hookean import NeoHookean
@@ -19,6 +20,17 @@ MODELS: dict[str, type[Material]] = {
     "neo-hookean": NeoHookean,
     "stable-neo-hookean": StableNeoHookean,
 }
+
+
+def model_of(name: str) -> type[Material]:
+    """The material of that name, as ``pbng bench --model`` takes them.
+
+    Raises:
+        InputError: There is none; it names those that there are.
+    """
+    if name not in MODELS:
+        raise InputError(f"no model {name!r} to measure; there are {', '.join(MODELS)}")
+    return MODELS[name]
 
 
 def hard_start(mesh: TetMesh, material: Material) -> Problem:
@@ -37,7 +49,13 @@ def box(n: int) -> TetMesh:
 
 
 def delaunay(n: int, seed: int = 0) -> TetMesh:
-    """Delaunay tets of a jittered grid of n³ vertices, vertices and cells in random order, without slivers."""
+    """Delaunay tets of a jittered grid of n³ vertices, vertices and cells in random order, without slivers.
+
+    Raises:
+        InputError: n is below 2.
+    """
+    if n < 2:
+        raise InputError(f"delaunay: there must be at least 2 vertices along an edge, not {n}")
     rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(float)
     inside = (grid > 0) & (grid < n - 1)

@@ -10,11 +10,12 @@ from typing import Any
 import numba
 import numpy as np
 
-from pbng.bench.scenes import MODELS, box, delaunay, hard_start
+from pbng.bench.scenes import box, delaunay, hard_start, model_of
 from pbng.bench.timing import interleaved, peak_memory
 from pbng.errors import InputError
 from pbng.packing import pack_problem
 from pbng.problem import Problem
+from pbng.solvers.threads import check_threads
 from pbng.sweep import sweep
 
 PAPER_NS = {32: 187, 64: 52}  # ns a tet and iteration on 8 threads of a Threadripper 3995WX (Table 1)
@@ -27,10 +28,13 @@ def measure(
 ) -> list[Row]:
     """One row a mesh, model and number of threads; ``reference`` is the folder of an implementation to run against."""
     rows = []
+    for count in threads:
+        check_threads("bench sweep", count)
+    materials = {model: model_of(model)(E=1e5, nu=0.3, density=10.0) for model in models}
     for kind, n in cases:
         mesh = MESHES[kind](n)
-        for model in models:
-            problem = hard_start(mesh, MODELS[model](E=1e5, nu=0.3, density=10.0))
+        for model, material in materials.items():
+            problem = hard_start(mesh, material)
             start = time.perf_counter()
             packed = pack_problem(problem, np.dtype(dtype))
             first = time.perf_counter() - start  # holds compilation

@@ -111,6 +111,7 @@ class Comparison:
                 "elements": problem.n_elem,
                 "prescribed": int(problem.fixed.sum()),
                 "weak_constraints": sum(len(w.vertices) for w in problem.weak),
+                "contacts": 0 if self.start.contacts is None else len(self.start.contacts),
                 "materials": materials,
                 "size": self.size,
                 "at": self.start.at,

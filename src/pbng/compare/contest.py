@@ -10,7 +10,7 @@ import numpy as np
 
 from pbng.compare.comparison import Comparison
 from pbng.compare.curve import Curve, Reached
-from pbng.compare.reference import Reference, converged, given
+from pbng.compare.reference import Reference, converged, given, touching
 from pbng.compare.runner import Limits, Runner
 from pbng.compare.start import Judge, Start
 from pbng.errors import InputError
@@ -37,12 +37,14 @@ def contest(
     looks: int = 40,
     rounds: int = 1,
     monitor: Monitor | None = None,
+    leave_out: Callable[[str, str], Any] | None = None,
 ) -> Comparison:
     """Run every solver from the same start, for equal iterations, equal seconds or both, whichever ends first.
 
     A method is set up for itself and warmed up, neither on its clock, which runs only while it starts and steps. It
     ends before its limit when rounding keeps its residual from falling (``PRECISION``) or its state is not finite
-    (``DIVERGED``).
+    (``DIVERGED``). Where things may touch, all are given the contacts of the equilibrium
+    (:func:`pbng.compare.reference.touching`), which takes a solve.
 
     Args:
         problem: A scene, or the problem it compiled to.
@@ -57,23 +59,28 @@ def contest(
         rounds: How often to measure. States are the same in every round; times are medians, the methods taking turns.
         monitor: Called with a label and the share of its limits that is used up, whenever a method has been looked at;
             with "reference" while that is computed.
+        leave_out: Called with the label of a solver that cannot do the problem, and why; it is then left out. Without
+            this it is an error.
 
     Raises:
-        InputError: Something given cannot be used, or a solver cannot do the problem; it names those that can.
+        InputError: Something given cannot be used, or a solver cannot do the problem; it names those that can. Or no
+            solver can.
     """
     problem = problem.compile() if isinstance(problem, Scene) else problem
     limits = _limits(solvers, iterations, seconds, looks)
     if rounds < 1:
         raise InputError(f"contest: rounds must be at least 1, not {rounds}")
     begin = Start.of(problem, start, at)
-    runners = set_up(problem, solvers, begin)
-    if monitor is not None and isinstance(reference, str):
+    problem = problem.at(begin.at)
+    runners = set_up(problem, solvers, leave_out)
+    if monitor is not None and (isinstance(reference, str) or problem.contact is not None):
         monitor("reference", 0.0)
+    begin = touching(problem, begin)
     known = _reference(problem, begin, reference)
-    judge = Judge(problem, begin.targets, known.x if known is not None and known.certain else None)
+    judge = Judge(problem, begin, known.x if known is not None and known.certain else None)
     curves = {}
     for label, runner in runners.items():
-        runner.warm_up()
+        runner.warm_up(begin)
         curves[label] = runner.watch(judge, limits[label], _told(monitor, label, rounds))
     for k in range(1, rounds):
         for label, runner in runners.items():
@@ -82,21 +89,24 @@ def contest(
                 monitor(label, (k + 1) / rounds)
     return Comparison(
         problem=problem,
-        solvers=dict(solvers),
+        solvers={label: solvers[label] for label in runners},
         curves=curves,
         start=begin,
         energy=judge.look(begin.x).energy,
         first=judge.look(begin.x).residual,
         reference=known,
-        iterations={label: limit.iterations for label, limit in limits.items()},
+        iterations={label: limits[label].iterations for label in runners},
         seconds=seconds,
         looks=looks,
         rounds=rounds,
     )
 
 
-def set_up(problem: Problem, solvers: Mapping[str, Solver], start: Start) -> dict[str, Runner]:
-    """All solvers set up for a problem, before any work is done.
+def set_up(
+    problem: Problem, solvers: Mapping[str, Solver], leave_out: Callable[[str, str], Any] | None = None
+) -> dict[str, Runner]:
+    """All solvers set up for a problem, before any work is done; without those that cannot do it, if ``leave_out`` is
+    there to be told.
 
     Raises:
         InputError: Some cannot do it; all are named, with the reason, and those that can.
@@ -104,10 +114,13 @@ def set_up(problem: Problem, solvers: Mapping[str, Solver], start: Start) -> dic
     runners, refused = {}, {}
     for label, solver in solvers.items():
         try:
-            runners[label] = Runner(label, solver, problem, start)
+            runners[label] = Runner(label, solver, problem)
         except InputError as error:
             refused[label] = str(error)
-    if refused:
+    if runners and leave_out is not None:
+        for label, why in refused.items():
+            leave_out(label, why)
+    elif refused:
         able = f"{', '.join(runners)} can" if runners else "nor can any other that was named"
         raise InputError(
             "; ".join(f"{label} cannot do this scene: {why}" for label, why in refused.items()) + f"; {able}"

@@ -1,12 +1,13 @@
 """The equilibrium that errors are distances from: found by two grids, certified by Newton where that is cheap."""
 
+import logging
 import time
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from pbng.compare.start import Judge, Start, distance
+from pbng.equilibrium import Toucher, equilibrium
 from pbng.problem import Problem
 from pbng.solvers.base import Budget, Result, Status
 from pbng.solvers.loop import run
@@ -18,6 +19,9 @@ CERTAIN = 1e-9  # of it: what an equilibrium may have left
 CYCLES, STEPS, LAST = 300, 60, 5
 CHEAP = 200_000  # elements up to which Newton's method is asked, too
 PATIENCE = 120.0  # seconds [s] that it is given
+SETTLED = 1e-5  # of the first residual: where rounds that find what touches stop
+
+log = logging.getLogger("pbng")
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,39 +65,60 @@ def given(problem: Problem, start: Start, x: np.ndarray) -> Reference:
     return _judged(problem, start, x, "given", True)
 
 
+def touching(problem: Problem, start: Start, threads: int | None = None) -> Start:
+    """The start with what touches, for all methods: that of the equilibrium which rounds come to from rest.
+
+    A solve finds contacts anew in each round, at states of its own, so that methods would be given different problems.
+    Those of the last round are right for all: with them the equilibrium is that of :func:`pbng.solve`.
+    """
+    if problem.contact is None:
+        return start
+    method = MultigridPBNG(dtype="float64", threads=threads).set_up(replace(problem))
+    toucher = Toucher(problem, method)
+    found = _finished(equilibrium(method, toucher, problem.X, 0.0, start.at, Budget(rtol=SETTLED, iterations=CYCLES)))
+    if found.status not in (Status.CONVERGED, Status.PRECISION):
+        log.warning(
+            "pbng: what touches is not settled: rounds came to %.0e of the first residual only", found.reduction
+        )
+    contacts = toucher.contacts
+    return replace(start, x=contacts.put_outside(start.x), contacts=contacts if len(contacts) else None)
+
+
 def converged(problem: Problem, start: Start, threads: int | None = None) -> Reference:
     """The equilibrium that lies on the way from a start.
 
-    There may be several, and another method may end in another one. What is not ``certain`` is no equilibrium.
+    There may be several, and another method may end in another one. What is not ``certain`` is no equilibrium. Newton's
+    method is not asked where things may touch.
 
     Args:
         problem: What is solved.
         start: From where.
         threads: Threads; by default as many as prove fastest.
     """
-    began = time.perf_counter()
-    first = problem.residual(start.x, start.targets)
+    began, problem = time.perf_counter(), problem.at(start.at)
+    first = Judge(problem, start).look(start.x).residual
     grids = MultigridPBNG(dtype="float64", threads=threads).set_up(replace(problem))
-    found = _run(grids, start.x, Budget(rtol=FOUND, iterations=CYCLES), before=start.before, targets=start.targets)
+    budget = Budget(rtol=FOUND, iterations=CYCLES)
+    found = _finished(run(grids, start.x, budget, before=start.before, targets=start.targets, contacts=start.contacts))
     out = _judged(problem, start, found.x, "MultigridPBNG", _certain(found, first))
-    if problem.n_elem <= CHEAP:
+    if problem.n_elem <= CHEAP and problem.contact is None:
         method = Newton(threads=threads).set_up(replace(problem))
         finite = np.isfinite(found.x).all()
         x, before = (np.asarray(found.x, float), None) if finite else (start.x, start.before)
         budget = Budget(atol=max(0.1 * FOUND * first, method.floor()), iterations=STEPS, seconds=PATIENCE)
-        newton = _run(method, x, budget, before=before, targets=start.targets)
+        newton = _finished(run(method, x, budget, before=before, targets=start.targets))
         if _certain(newton, first):
             # The first residual of a bad start is huge; what Newton's method still gains from there costs little.
-            last = _run(method, newton.x, Budget(atol=10 * method.floor(), iterations=LAST), targets=start.targets)
+            budget = Budget(atol=10 * method.floor(), iterations=LAST)
+            last = _finished(run(method, newton.x, budget, targets=start.targets))
             newton = last if last.residual < newton.residual else newton
             apart = distance(newton.x, x) if out.certain else float("nan")
             out = replace(_judged(problem, start, newton.x, "Newton", True), distance=apart)
     return replace(out, seconds=time.perf_counter() - began)
 
 
-def _run(*given: Any, **options: Any) -> Result:
-    """The loop's result; an interrupted one is none."""
-    result = run(*given, **options)
+def _finished(result: Result) -> Result:
+    """The result; an interrupted one is none."""
     if result.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return result
@@ -105,7 +130,7 @@ def _certain(result: Result, first: float) -> bool:
 
 
 def _judged(problem: Problem, start: Start, x: np.ndarray, by: str, certain: bool) -> Reference:
-    judge = Judge(problem, start.targets)
+    judge = Judge(problem, start)
     seen, first = judge.look(x), judge.look(start.x).residual
     ratio = seen.residual / first if first > 0 else 0.0
     return Reference(np.asarray(x, float), seen.residual, seen.energy, ratio, by, certain, seen.inverted)

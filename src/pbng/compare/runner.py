@@ -65,22 +65,22 @@ class Runner:
     Args:
         label: What it is called.
         solver: The method.
-        problem, start: What it solves, and from where.
+        problem: What it solves.
 
     Raises:
         InputError: The solver cannot do the problem.
     """
 
-    def __init__(self, label: str, solver: Solver, problem: Problem, start: Start) -> None:
-        self.label, self.begin_at = label, start
+    def __init__(self, label: str, solver: Solver, problem: Problem) -> None:
+        self.label = label
         before = compile_seconds()
         self.method, self.setup_seconds = timed(lambda: solver.set_up(replace(problem)))
         self.compile_seconds = compile_seconds() - before
 
-    def warm_up(self) -> None:
-        """Compile and load what the first steps need."""
-        before = compile_seconds()
-        self.begin_at.begin(self.method)
+    def warm_up(self, start: Start) -> None:
+        """Compile and load what the first steps need; from now on it begins there."""
+        before, self.begin_at = compile_seconds(), start
+        start.begin(self.method)
         for _ in range(WARM_UP):
             self.method.step()
         self.method.settle()

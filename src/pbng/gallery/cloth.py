@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from pbng.checks import checked_number
 from pbng.contact.colliders import Sphere
 from pbng.gallery.motion import Eased
-from pbng.gallery.recipe import Recipe
+from pbng.gallery.recipe import Recipe, checked_count
 from pbng.materials.bending import Bending
 from pbng.materials.membrane import Membrane
 from pbng.motions import Rotate, Translate
@@ -28,6 +29,7 @@ def cloth_on_sphere(resolution: int = 48) -> Recipe:
     Args:
         resolution: Vertices along an edge of the cloth.
     """
+    checked_count("cloth_on_sphere: resolution", resolution, 2)
     scene = Scene(gravity=GRAVITY, name="cloth_on_sphere")
     mesh = sheet((EDGE, EDGE), resolution, (-EDGE / 2, 0.02, -EDGE / 2))
     thickness = _thickness(EDGE, resolution)
@@ -44,8 +46,10 @@ def hanging_cloth(resolution: int = 32, k_bend: float = 0.0) -> Recipe:
         resolution: Vertices along the short side; 64 are the paper's 8 K.
         k_bend: Stiffness against bending [N m]; the paper's is 0.
     """
+    checked_count("hanging_cloth: resolution", resolution, 2)
+    k_bend = checked_number("hanging_cloth: k_bend", k_bend, positive=False)
     scene = Scene(gravity=GRAVITY, name="hanging_cloth")
-    mesh = sheet((2.0, 1.0), (2 * resolution, resolution) if resolution > 0 else resolution, (-1.0, 0.0, 0.0))
+    mesh = sheet((2.0, 1.0), (2 * resolution, resolution), (-1.0, 0.0, 0.0))
     cloth = scene.add(mesh, Membrane(E=1e3, nu=0.3, density=10.0), Bending(k_bend), name="cloth")
     scene.pin(cloth.where((mesh.X[:, 2] == 0) & (np.abs(mesh.X[:, 0]) == 1)))
     return Recipe(scene, frames=61, inertia=True, substeps=7, budget=Budget(iterations=44))
@@ -57,9 +61,10 @@ def twisted_cloth(resolution: int = 24) -> Recipe:
     Args:
         resolution: Vertices across the strip.
     """
+    checked_count("twisted_cloth: resolution", resolution, 2)
     scene = Scene(name="twisted_cloth")
     length, width = STRIP
-    along = max(2, round(length / width * (resolution - 1)) + 1)
+    along = round(length / width * (resolution - 1)) + 1
     mesh = sheet(STRIP, (along, resolution), (-length / 2, 0.0, -width / 2))
     strip = scene.add(mesh, Membrane(E=500.0, nu=0.3, density=0.2), Bending(1e-4, weighted=True), name="strip")
     for side in (-1, 1):
@@ -71,5 +76,5 @@ def twisted_cloth(resolution: int = 24) -> Recipe:
 
 
 def _thickness(edge: float, vertices: int) -> float:
-    """Distance [m] that is kept from cloth: a fifth of the distance of its vertices, but 1 cm at most."""
-    return min(0.25 * edge / max(vertices - 1, 1), 0.01)
+    """Distance [m] that is kept from cloth: a quarter of the distance of its vertices, but 1 cm at most."""
+    return min(0.25 * edge / (vertices - 1), 0.01)

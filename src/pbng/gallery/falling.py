@@ -5,10 +5,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from pbng.checks import checked_number
 from pbng.contact.colliders import container
-from pbng.errors import InputError
 from pbng.gallery.gravity import filled
-from pbng.gallery.recipe import Recipe
+from pbng.gallery.recipe import Recipe, checked_count
 from pbng.gallery.solids import ball, brick, plank, ring, rod
 from pbng.materials.bending import Bending
 from pbng.materials.corotated import Corotated
@@ -45,7 +45,8 @@ def dropping_shapes(resolution: int = 12, shapes: int = 40) -> Recipe:
     Raises:
         InputError: The resolution is below 4, or there is no shape.
     """
-    _check("dropping_shapes", resolution, 4, shapes)
+    checked_count("dropping_shapes: resolution", resolution, 4)
+    checked_count("dropping_shapes: shapes", shapes, 1)
     scene = Scene(gravity=GRAVITY, name="dropping_shapes")
     flesh = Corotated(E=SHAPE_E, nu=NU, density=DENSITY)
     meshes = [make(resolution) for make in SHAPES]
@@ -80,9 +81,12 @@ def armadillos(
         free_at: When the corners are let go [s].
 
     Raises:
-        InputError: The file cannot be read, nothing can be made of it, or there is no body.
+        InputError: The file cannot be read, nothing can be made of it, or a count or time is none.
     """
-    _check("armadillos", resolution, 4, bodies)
+    checked_count("armadillos: resolution", resolution, 4)
+    checked_count("armadillos: bodies", bodies, 1)
+    checked_count("armadillos: cloth", cloth, 2)
+    free_at = checked_number("armadillos: free_at", free_at)
     scene = Scene(gravity=GRAVITY, name="armadillos")
     mesh = _of_length(filled("armadillos", surface, resolution), LENGTH)
     stuff = Membrane(E=CLOTH_E, nu=NU, density=CLOTH_DENSITY)
@@ -99,9 +103,10 @@ def armadillos(
     for k, place in enumerate(_layers(bodies, 2, 2 * MARGIN * radius, 1.2 * radius)):
         scene.add(_turned(mesh, rng), flesh, name=f"body {k}", at=place)
     half = CLOTH / 2 + 0.4
-    scene.collide_with(container((-half, -DEPTH, -half), (half, -1.5, half), name="glass box"))
+    # Friction lets the bodies come to rest in the box.
+    scene.collide_with(container((-half, -DEPTH, -half), (half, -1.5, half), friction=0.3, name="glass box"))
     scene.contact()
-    frames = 1 + round(30 * (free_at + 2.0))
+    frames = 1 + round(30 * (free_at + 3.0))
     return Recipe(scene, frames=frames, inertia=True, substeps=9, budget=Budget(iterations=40))
 
 
@@ -143,10 +148,3 @@ def _radius(mesh: TetMesh) -> float:
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v)
-
-
-def _check(scene: str, resolution: int, least: int, bodies: int) -> None:
-    if not (isinstance(resolution, int) and resolution >= least):
-        raise InputError(f"{scene}: resolution must be a whole number of at least {least}, not {resolution}")
-    if not (isinstance(bodies, int) and bodies >= 1):
-        raise InputError(f"{scene}: there must be at least one body, not {bodies}")

@@ -7,7 +7,7 @@ import numpy as np
 
 from pbng.errors import InputError
 from pbng.gallery.motion import Eased
-from pbng.gallery.recipe import Recipe
+from pbng.gallery.recipe import Recipe, checked_count
 from pbng.io.meshes import MESHES, read_mesh, read_surface
 from pbng.materials.corotated import Corotated
 from pbng.mesh import Mesh, TetMesh, TriMesh
@@ -49,8 +49,7 @@ def bent_surface(surface: str | os.PathLike[str] | TriMesh | None = None, resolu
     Raises:
         InputError: The file cannot be read, or nothing can be made of it.
     """
-    if not (isinstance(resolution, int) and resolution >= 2):
-        raise InputError(f"bent_surface: resolution must be a whole number of at least 2, not {resolution}")
+    checked_count("bent_surface: resolution", resolution, 2)
     mesh = laid_along_x(filled("bent_surface", surface, resolution))
     E, end = min((softness(mesh, end), end) for end in (1, -1))
     along = end * mesh.X[:, 0]
@@ -108,11 +107,13 @@ def filled(scene: str, surface: str | os.PathLike[str] | TriMesh | None, resolut
     elif isinstance(surface, Mesh):
         found = surface
     else:
+        if not isinstance(surface, str | os.PathLike):
+            raise InputError(f"{scene}: surface must be a file or a surface, not {surface!r}")
         found = read_mesh(surface) if Path(surface).suffix.lower() in MESHES else read_surface(surface)
     if isinstance(found, TetMesh):
         return found
     if not isinstance(found, TriMesh):
-        raise InputError(f"{scene}: expected a file or a surface, not {type(surface).__name__}")
+        raise InputError(f"{scene}: surface must be a file or a surface, not a {type(surface).__name__}")
     return tetrahedralize(found, cell=float(np.ptp(found.X, axis=0).max()) / resolution)
 
 

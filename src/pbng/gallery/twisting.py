@@ -1,7 +1,7 @@
 """Blocks that are squeezed, stretched and twisted (section 11.1): one, several resolutions, several materials."""
 
 from pbng.gallery.motion import Eased
-from pbng.gallery.recipe import Recipe
+from pbng.gallery.recipe import Recipe, checked_count
 from pbng.materials.base import Material
 from pbng.materials.corotated import Corotated
 from pbng.materials.neo_hookean import NeoHookean
@@ -35,10 +35,11 @@ def resolutions(resolution: int = 32) -> Recipe:
     Args:
         resolution: Vertices along an edge of the finest, 128 in the paper; the others have a half and a quarter of it.
     """
+    checked_count("resolutions: resolution", resolution, 2)
     scene = Scene(name="resolutions")
     rubber = Corotated(E=E, nu=NU, density=DENSITY)
     for level, n in enumerate((resolution // 4, resolution // 2, resolution)):
-        _twist(scene, _block(scene, max(2, n) if resolution >= 2 else resolution, rubber, f"level {level}", 2 - level))
+        _twist(scene, _block(scene, max(2, n), rubber, f"level {level}", 2 - level))
     return Recipe(scene, budget=BUDGET)
 
 

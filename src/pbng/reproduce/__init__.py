@@ -44,6 +44,7 @@ _ALL = (
     Experiment("fig16", "contact", "Bodies fall onto a cloth that gives way."),
     Experiment("fig17", "springs", "Two blocks bound by stiff springs: XPBD-QS depends on the order."),
     Experiment("fig18", "bar", "A bar under gravity: PBD loses its weight."),
+    Experiment("fig19", "cloth", "A cloth swings by two corners: too stretchy on few plain iterations."),
     Experiment("table1", "colors", "Colours of vertices and of constraints, time an iteration."),
     Experiment("table2", "budgets", "Time and iterations a frame of each method."),
     Experiment("table3", "blocks", "Time a frame of PBNG, scene by scene."),
