@@ -175,6 +175,35 @@ def test_who_gets_into_a_deforming_mesh_is_held():
     assert np.allclose(np.linalg.norm(touches.normal, axis=1), 1)
 
 
+def parts(*placed):
+    """One surface of cubes about the origin: their edge lengths, negative for one inside-out, and where they are."""
+    X = np.concatenate([(CUBE.X - 0.5) * abs(edge) + at for edge, at in placed])
+    triangles = [SURFACE[:, ::-1] if edge < 0 else SURFACE for edge, _ in placed]
+    return pbng.TriMesh(X, np.concatenate([t + len(CUBE.X) * k for k, t in enumerate(triangles)]))
+
+
+def test_cavities_are_outside():
+    """A cube, hollow but for another cube within it, beside one more; also turned, and grown by its motion."""
+    mesh = parts((1.0, (0, 0, 0)), (-0.6, (0, 0, 0)), (0.2, (0, 0, 0)), (1.0, (2, 0, 0)))
+    p = np.array([[0, 0, 0], [0.2, 0, 0], [0.4, 0, 0], [0.7, 0, 0], [2, 0, 0]])
+    expected = np.array([-0.1, 0.1, -0.1, 0.2, -0.5])
+    assert np.allclose(Kinematic(mesh).distance(p)[0], expected)
+    turned = Kinematic(mesh, motion=Scale((-1, -1, 1), center=(0, 0, 0)), over=1.0)
+    assert np.allclose(turned.distance(p * (-1, -1, 1), 1.0)[0], expected)
+    grown = Kinematic(mesh, motion=Scale(2.0, center=(0, 0, 0)), over=1.0, start=0.5)
+    assert np.allclose(grown.distance(2 * p, 1.5)[0], 2 * expected)
+
+
+def test_a_cavity_may_touch_the_outside():
+    """At a vertex that both have, and with a wall of no thickness: face upon face."""
+    a, b = parts((1.0, (0, 0, 0)), (-0.5, (0.25, 0.25, 0.25))), parts((1.0, (0, 0, 0)), (-0.5, (0.25, 0, 0)))
+    Kinematic(b)
+    X, index = np.unique(a.X, axis=0, return_inverse=True)
+    assert len(X) == 15
+    d = Kinematic(pbng.TriMesh(X, index.ravel()[a.cells])).distance(np.array([[0.2, 0.2, 0.2], [-0.2, -0.2, -0.2]]))[0]
+    assert np.allclose(d, [0.2, -0.3])
+
+
 @pytest.mark.parametrize(
     ("make", "word"),
     [
@@ -183,6 +212,45 @@ def test_who_gets_into_a_deforming_mesh_is_held():
         (
             lambda: Kinematic(pbng.TriMesh(CUBE.X, SURFACE[:, ::-1]), name="body"),
             r"body: the surface is inside-out: its signed volume is -1 m³; reverse its triangles",
+        ),
+        (
+            lambda: Kinematic(parts((1.0, (0, 0, 0)), (-0.3, (2, 0, 0))), name="body"),
+            "body: the part of 12 triangles that vertex 10 belongs to is inside-out: its signed volume is -0.027 m³,"
+            " and it is no cavity of another; reverse its triangles",
+        ),
+        (
+            lambda: Kinematic(parts((1.0, (0, 0, 0)), (-1.0, (1, 0, 0)))),  # side by side, face upon face
+            "vertex 10 belongs to is inside-out",
+        ),
+        (
+            lambda: Kinematic(parts((-1.0, (0, 0, 0)), (-0.3, (0, 0, 0)))),  # nothing is inside of what is inside-out
+            "vertex 2 belongs to is inside-out: its signed volume is -1 m³",
+        ),
+        (
+            lambda: Kinematic(parts((1.0, (0, 0, 0)), (-0.5, (0, 0, 0)), (-0.3, (0, 0, 0)))),  # nor within a cavity
+            "vertex 18 belongs to is inside-out",
+        ),
+        (
+            lambda: Kinematic(CUBE, motion=Scale(-1.0), over=2.0, start=1.0, name="body"),
+            "body: the surface is inside-out at the end of the motion, 3 s: its signed volume is -1 m³; the motion must"
+            " not turn it over or flatten it",
+        ),
+        (
+            lambda: Kinematic(CUBE, motion=Scale((1, 0, 1)) + Rotate((1, 2, 3), 0.1)),
+            "the surface is inside-out at the end of the motion, 0 s: its signed volume is ",
+        ),
+        (
+            lambda: Kinematic(  # the cavity leaves its cube
+                parts((1.0, (0, 0, 0)), (-0.6, (0, 0, 0))),
+                motion=lambda t, X: X + np.array([3.0, 0, 0]) * (np.arange(16) >= 8)[:, None],
+            ),
+            "vertex 10 belongs to is inside-out at the end of the motion",
+        ),
+        (
+            lambda: Kinematic(
+                CUBE, motion=pbng.Animation(np.array([0.0, 1.0]), np.stack([CUBE.X, CUBE.X * (1, 1, -1)]))
+            ),
+            "inside-out at the end of the motion, 1 s",
         ),
         (
             lambda: Kinematic(pbng.TriMesh(CUBE.X, np.concatenate([SURFACE[:5], SURFACE[5:6, ::-1], SURFACE[6:]]))),

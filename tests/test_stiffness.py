@@ -9,7 +9,7 @@ from grids import SOFT, coarse_space, dense, free, grid_over, shaken, u_shape
 import pbng
 from pbng.coarse import linear
 from pbng.coarse.grid import make_grid
-from pbng.coarse.linear import SHIFT, BlockMatrix, GridSolver, interpolation
+from pbng.coarse.linear import SHIFT, GridMatrix, GridSolver, interpolation
 from pbng.coarse.stiffness import Cubature
 
 
@@ -122,7 +122,7 @@ def test_assembled_matrix(rng):
     mean = np.einsum("nii->n", blocks) / 3
     least = np.where(np.arange(grid.n_node) % 3 == 0, 1.5, 0.5) * mean
     expected += np.diag(np.repeat(np.maximum(least - mean, SHIFT * mean), 3))
-    matrix = BlockMatrix(grid.node, grid.n_node)
+    matrix = GridMatrix(grid.node, grid.n_node)
     matrix.assemble(K, least)
     np.testing.assert_allclose(matrix.sparse().toarray(), expected, atol=1e-12 * np.abs(expected).max())
     v = rng.standard_normal((grid.n_node, 3))

@@ -16,6 +16,7 @@ from pbng.coloring import color_nodes
 from pbng.constraints import WeakConstraints
 from pbng.elements.base import ElementKind
 from pbng.problem import Problem
+from pbng.topology import entries
 
 LINKS = 16  # of a chain of ties that are followed
 
@@ -71,9 +72,7 @@ class Compounds:
         compound, vertex, beta = member.row[order], member.col[order], member.data[order]
         found = []
         for c in self.problem.couplings:
-            first, count = c.start[vertex], np.diff(c.start)[vertex]
-            which = np.repeat(np.arange(len(vertex)), count)
-            at = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + first[which]
+            which, at = entries(c.start, vertex)
             cell, corner = c.incident[at] // c.corners, c.incident[at] % c.corners
             key, inverse = np.unique(compound[which] * len(c.cells) + cell, return_inverse=True)
             shares = np.zeros((len(key), c.corners))

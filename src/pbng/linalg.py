@@ -15,6 +15,12 @@ from pbng.jit import FLAGS, leaf
 
 
 @leaf
+def point(x, v):
+    """Row v of the array x (n, 3)."""
+    return x[v, 0], x[v, 1], x[v, 2]
+
+
+@leaf
 def add(a, b):
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
@@ -48,6 +54,14 @@ def combine3(s, a, t, b, u, c):
 @leaf
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@leaf
+def unit(a):
+    """The direction of a; zero for zero."""
+    real = type(a[0])
+    length = math.sqrt(dot(a, a))
+    return scale(real(1) / length if length > real(0) else real(0), a)
 
 
 @leaf

@@ -5,7 +5,6 @@ elements in lanes, added to the matrix chunk by chunk, chunks that share no vert
 and the same bits for any number of threads.
 """
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ import scipy.sparse
 from numba import uint64
 
 from pbng.assembly import CHUNK, ElementBlocks
+from pbng.blocks import BlockMatrix
 from pbng.constraints import WeakEnergy
 from pbng.dispatch import call, specialised
 from pbng.elements.base import W, gather
@@ -37,49 +37,13 @@ from pbng.elements.stiffness import (
 )
 from pbng.errors import InputError
 from pbng.jit import serial
-from pbng.parallel import address, array, body, call_at, each, rows, run, scratch
+from pbng.parallel import address, array, body, call_at, rows, run, scratch
 from pbng.problem import Problem
 
 PROJECTIONS = ("none", "clamp", "abs")
 FLOOR = 1e-6  # of the a of a material's block: the least eigenvalue of what is projected
 FULL_WAY, PROJECTED_WAY, SPECTRAL_WAY = range(3)  # see pbng.elements.stiffness
 zero = uint64(0)
-
-
-class BlockMatrix:
-    """A square matrix of 3x3 blocks in compressed rows.
-
-    Attributes:
-        start: Where each row's blocks start, (n + 1,) int64.
-        column: Columns of the blocks, rising in each row, (n_block,) int32.
-        value: The blocks [N/m], each row by row, (n_block, 9) float64.
-    """
-
-    def __init__(self, start: np.ndarray, column: np.ndarray) -> None:
-        self.start, self.column = start, column
-        self.value = np.zeros((len(column), 9))
-
-    def __len__(self) -> int:
-        """Number of rows of blocks."""
-        return len(self.start) - 1
-
-    def __matmul__(self, x: np.ndarray) -> np.ndarray:
-        """The product with x (n, 3), or flat (3 n,)."""
-        x = np.ascontiguousarray(x, float)
-        y = np.empty_like(x)
-        each(_multiply, (self.start, self.column, self.value, x, y), len(self), grain=256)
-        return y
-
-    @cached_property
-    def diagonal(self) -> np.ndarray:
-        """Numbers of the diagonal blocks, (n,)."""
-        row = np.repeat(np.arange(len(self)), np.diff(self.start))
-        return np.flatnonzero(row == self.column)
-
-    def sparse(self) -> scipy.sparse.bsr_matrix:
-        """As SciPy's matrix (3 n, 3 n), which shares the values."""
-        n = 3 * len(self)
-        return scipy.sparse.bsr_matrix((self.value.reshape(-1, 3, 3), self.column, self.start), shape=(n, n))
 
 
 class StiffnessMatrix(ElementBlocks):
@@ -272,20 +236,3 @@ def _places(blocks, corners, idx, place_at, start, column, place):
                                 high = middle
                         to = low
                     place[place_at[b] + W * (k * a + c) + l] = to
-
-
-@body
-def _multiply(arguments, low, high):
-    """Body of the product of a matrix and a vector, for rows low .. high."""
-    start, column = array(arguments, 0, np.int64), array(arguments, 1, np.int32)
-    value, x, y = array(arguments, 2, np.float64), array(arguments, 3, np.float64), array(arguments, 4, np.float64)
-    for r in range(low, high):
-        y0, y1, y2 = 0.0, 0.0, 0.0
-        for k in range(start[r], start[r + 1]):
-            v, c = uint64(9) * uint64(k), uint64(3) * uint64(column[k])
-            x0, x1, x2 = x[c], x[c + uint64(1)], x[c + uint64(2)]
-            y0 += value[v] * x0 + value[v + uint64(1)] * x1 + value[v + uint64(2)] * x2
-            y1 += value[v + uint64(3)] * x0 + value[v + uint64(4)] * x1 + value[v + uint64(5)] * x2
-            y2 += value[v + uint64(6)] * x0 + value[v + uint64(7)] * x1 + value[v + uint64(8)] * x2
-        o = uint64(3) * uint64(r)
-        y[o], y[o + uint64(1)], y[o + uint64(2)] = y0, y1, y2

@@ -34,6 +34,21 @@ def incidence(cells, n_vert):
     return start, incident
 
 
+def entries(start: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The entries of some of the rows of a compressed table, one row after the other.
+
+    Args:
+        start: Where the rows start, (n + 1,): row r has the entries ``start[r]`` to ``start[r + 1] - 1``.
+        row: The rows asked for, (k,), in any order; one may be asked for more than once.
+
+    Returns:
+        For each entry which of the rows asked for it is of, from 0 to k - 1, and its number.
+    """
+    first, count = start[row], start[row + 1] - start[row]
+    of = np.repeat(np.arange(len(row)), count)
+    return of, np.arange(len(of)) + (first - np.cumsum(count) + count)[of]
+
+
 @serial
 def _match_faces(cells, faces, n_vert):
     """Partner of every face: -1 on the boundary, else the other face; and the first bad pair found.
@@ -107,8 +122,28 @@ def tet_faces(cells: np.ndarray, n_vert: int) -> tuple[np.ndarray, np.ndarray]:
 
 def unique_edges(cells: np.ndarray, local: np.ndarray) -> np.ndarray:
     """Edges (m, 2) int32 of cells, each once, the smaller vertex first, in lexicographic order."""
-    pairs = np.sort(cells[:, local].reshape(-1, 2).astype(np.int64), axis=1)
-    keys = np.unique(pairs[:, 0] << 32 | pairs[:, 1])
+    return _ends(np.unique(_edge_keys(cells, local)))
+
+
+def edge_sides(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The edges of triangles, and which triangles are at each.
+
+    Returns the edges (n_edge, 2) int32 as :func:`unique_edges` does, and compressed rows: the sides
+    ``3 * triangle + side`` at edge e, numbered as in ``TRIANGLE_EDGES``, are ``sides[start[e]:start[e + 1]]``, rising.
+    """
+    key = _edge_keys(triangles, TRIANGLE_EDGES)
+    sides = np.argsort(key, kind="stable")
+    edges, first = np.unique(key[sides], return_index=True)
+    return _ends(edges), np.append(first, len(key)), sides
+
+
+def _edge_keys(cells: np.ndarray, local: np.ndarray) -> np.ndarray:
+    """A number for each edge of each cell, (n_cell * n_local,) int64: the same for the same edge, and in its order."""
+    a, b = cells[:, local].reshape(-1, 2).astype(np.int64).T
+    return np.minimum(a, b) << 32 | np.maximum(a, b)
+
+
+def _ends(keys: np.ndarray) -> np.ndarray:
     return np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1).astype(np.int32)
 
 
@@ -152,15 +187,13 @@ def hinges(triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
     first triangle, its third vertex, and that of the second; and the first bad edge as a code with its triangles: 1 for
     an edge of more than two triangles, 2 for two that run along it the same way, 0 for none.
     """
-    ends = triangles[:, TRIANGLE_EDGES].reshape(-1, 2).astype(np.int64)
-    key = ends.min(1) << 32 | ends.max(1)
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) != 0]))
-    count = np.diff(np.append(first, len(order)))
+    _, start, sides = edge_sides(triangles)
+    first, count = start[:-1], np.diff(start)
     many = np.flatnonzero(count > 2)
     if len(many):
-        return np.empty((0, 4), np.int32), 1, order[first[many[0]] :][: count[many[0]]] // 3
-    one, two = order[first[count == 2]], order[first[count == 2] + 1]
+        return np.empty((0, 4), np.int32), 1, sides[first[many[0]] :][: count[many[0]]] // 3
+    one, two = sides[first[count == 2]], sides[first[count == 2] + 1]
+    ends = triangles[:, TRIANGLE_EDGES].reshape(-1, 2)
     same = np.flatnonzero(ends[one, 0] == ends[two, 0])
     bad = np.array([one[same[:1]], two[same[:1]]]).ravel() // 3
     wings = (triangles[k // 3, (k % 3 + 2) % 3] for k in (one, two))

@@ -26,6 +26,7 @@ from pbng.linalg import combine, cross, dot, scale
 from pbng.materials.base import Model
 from pbng.parallel import array, body, each, rows
 from pbng.problem import ElementGroup, Problem
+from pbng.topology import entries
 
 FLOOR = 1e-5  # of the a of a material's block: lowest eigenvalue; the tension that holds cloth is little more
 STEP = 1e-6  # of a difference of stresses
@@ -104,9 +105,7 @@ def _expanded(
     kept: np.ndarray, summed: np.ndarray, R: scipy.sparse.csr_matrix
 ) -> tuple[np.ndarray, scipy.sparse.csr_matrix]:
     """Keys m * kept + j of Σ_s K[kept, s] R[s, j], and the matrix over the blocks of K that sums them."""
-    count = np.diff(R.indptr)[summed]
-    of = np.repeat(np.arange(len(summed)), count)
-    at = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + R.indptr[summed][of]
+    of, at = entries(R.indptr, summed)
     keys, to = np.unique(kept[of] * R.shape[1] + R.indices[at], return_inverse=True)
     return keys, scipy.sparse.csr_matrix((R.data[at], (to, of)), (len(keys), len(summed)))
 

@@ -12,6 +12,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from threadpoolctl import ThreadpoolController
 
+from pbng.blocks import BlockMatrix
 from pbng.coarse.cloth import Restriction
 from pbng.coarse.grid import Grid
 from pbng.jit import serial
@@ -25,8 +26,8 @@ MOST, MOST_CLOTH = 30, 100  # iterations of conjugate gradients
 DENSE = 400  # unknowns up to which the coarsest matrix is factorised as a dense one
 
 
-class BlockMatrix:
-    """A symmetric matrix of 3x3 blocks, one row of blocks a node, summed from the stiffness of pieces.
+class GridMatrix(BlockMatrix):
+    """A symmetric matrix, one row of blocks a node, summed from the stiffness of pieces.
 
     Args:
         node: Nodes of the pieces, (n_piece, 8).
@@ -58,10 +59,8 @@ class BlockMatrix:
             present = np.union1d(present, more)
         self.source_start = np.append(np.searchsorted(self.key, present), len(self.key))
         self.loose_at = np.searchsorted(present, self.loose)
-        self.column = (present % n).astype(np.int32)
-        self.start = np.searchsorted(present // n, np.arange(n + 1))
+        super().__init__(np.searchsorted(present // n, np.arange(n + 1)), (present % n).astype(np.int32))
         self.diagonal = np.flatnonzero(present // n == self.column)
-        self.value = np.empty((len(present), 9))
         self.constant = None
         if constant is not None:
             self.constant = np.zeros((len(present), 9))
@@ -77,15 +76,6 @@ class BlockMatrix:
         if self.constant is not None:
             self.value += self.constant
         _invert_diagonal(self.diagonal, self.value, self.inverse)
-
-    def __matmul__(self, x: np.ndarray) -> np.ndarray:
-        y = np.empty_like(x)
-        each(_multiply, (self.start, self.column, self.value, x, y), len(x), grain=256)
-        return y
-
-    def sparse(self) -> scipy.sparse.bsr_matrix:
-        n = len(self.start) - 1
-        return scipy.sparse.bsr_matrix((self.value.reshape(-1, 3, 3), self.column, self.start), shape=(3 * n, 3 * n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,14 +107,14 @@ class GridSolver:
         self.up = [interpolation(coarse) for coarse in grids[1:]]
         self.top, self.restrictions = top, []
         if top is None:
-            self.matrices = [BlockMatrix(g.node, g.n_node) for g in grids]
+            self.matrices = [GridMatrix(g.node, g.n_node) for g in grids]
         else:
             self.up.insert(0, top.up)
-            self.matrices, keys = [BlockMatrix(top.node, top.up.shape[0], top.keys)], top.keys
+            self.matrices, keys = [GridMatrix(top.node, top.up.shape[0], top.keys)], top.keys
             for grid, up in zip(grids, self.up):
                 self.restrictions.append(Restriction(keys, up))
                 keys = self.restrictions[-1].keys
-                self.matrices.append(BlockMatrix(grid.node, grid.n_node, keys))
+                self.matrices.append(GridMatrix(grid.node, grid.n_node, keys))
         self.down = [u.T.tocsr() for u in self.up]
         self.split = np.cumsum([len(g.node) for g in grids])[:-1]
 
@@ -156,8 +146,8 @@ class GridSolver:
                 cloth = self.restrictions[level](cloth)
         if exact is not None:
             m = self.matrices[0]
-            self.exact = m.value.copy()
-            self.exact[m.loose_at] += exact - definite
+            self.exact = BlockMatrix(m.start, m.column, m.value.copy())
+            self.exact.value[m.loose_at] += exact - definite
         coarsest = self.matrices[-1].sparse()
         if coarsest.shape[0] <= DENSE:
             factor = scipy.linalg.cho_factor(coarsest.toarray(), lower=True, overwrite_a=True, check_finite=False)
@@ -177,7 +167,7 @@ class GridSolver:
 
     def solve(self, b: np.ndarray, tolerance: float, most: int | None = None) -> np.ndarray:
         """Conjugate gradients until the residual, measured by the V-cycle, has fallen by ``tolerance``."""
-        x = self._solve(b, tolerance, most, self.matrices[0].value)
+        x = self._solve(b, tolerance, most, self.matrices[0])
         assert x is not None
         return x
 
@@ -187,19 +177,18 @@ class GridSolver:
 
     @_blas.wrap(limits=1, user_api="blas")
     def _solve(
-        self, b: np.ndarray, tolerance: float, most: int | None, value: np.ndarray, may_fail: bool = False
+        self, b: np.ndarray, tolerance: float, most: int | None, A: BlockMatrix, may_fail: bool = False
     ) -> np.ndarray | None:
         if not self.up:
             return self.cycle(b)
-        m = self.matrices[0]
-        x, r, q = np.zeros_like(b), b.copy(), np.empty_like(b)
+        x, r = np.zeros_like(b), b.copy()
         z = self.cycle(r)
         p, rz = z.copy(), float(np.vdot(r, z))
         first = rz
         for _ in range(most or (MOST_CLOTH if self.top else MOST)):
             if not rz > 0:
                 break
-            each(_multiply, (m.start, m.column, value, p, q), len(p), grain=256)
+            q = A @ p
             curvature = float(np.vdot(p, q))
             if may_fail and not curvature > 0:
                 return None
@@ -262,25 +251,6 @@ def _invert_diagonal(diagonal, value, inverse):
         for k in range(3):
             row = scale(d, adj[k])
             i[3 * k], i[3 * k + 1], i[3 * k + 2] = row
-
-
-@body
-def _multiply(arguments, low, high):
-    """Body of the product of a matrix and a vector, for rows low .. high."""
-    start, column = array(arguments, 0, np.int64), array(arguments, 1, np.int32)
-    value, x, y = (
-        rows(arguments, 2, 9, np.float64),
-        rows(arguments, 3, 3, np.float64),
-        rows(arguments, 4, 3, np.float64),
-    )
-    for r in range(low, high):
-        y0, y1, y2 = 0.0, 0.0, 0.0
-        for k in range(start[r], start[r + 1]):
-            a, u = value[k], x[column[k]]
-            y0 += a[0] * u[0] + a[1] * u[1] + a[2] * u[2]
-            y1 += a[3] * u[0] + a[4] * u[1] + a[5] * u[2]
-            y2 += a[6] * u[0] + a[7] * u[1] + a[8] * u[2]
-        y[r, 0], y[r, 1], y[r, 2] = y0, y1, y2
 
 
 @serial

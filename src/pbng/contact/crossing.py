@@ -6,7 +6,7 @@ import numpy as np
 
 from pbng.contact.bvh import DEPTH, BoxTree
 from pbng.jit import inline
-from pbng.linalg import add, cross, dot, sub
+from pbng.linalg import add, cross, dot, point, sub
 from pbng.parallel import array, body, each, rows
 
 GRAIN = 128  # points that a thread takes at a time
@@ -50,7 +50,7 @@ def _first_crossings(arguments, low, high):
     weights, side = rows(arguments, 10, 3, np.float64), array(arguments, 11, np.float64)
     stack = np.empty(DEPTH, np.int32)
     for q in range(low, high):
-        p0, p1 = _point(start, q), _point(stop, q)
+        p0, p1 = point(start, q), point(stop, q)
         path = sub(p1, p0)
         first, which, u, v, w, where = 2.0, -1, 0.0, 0.0, 0.0, 0.0
         stack[0], top = 0, 1
@@ -67,18 +67,13 @@ def _first_crossings(arguments, low, high):
             for e in range(nodes[i, 1], nodes[i, 2]):
                 a, b, c = cells[e, 0], cells[e, 1], cells[e, 2]
                 t, weight, s = _crossing(
-                    p0, p1, _point(x, a), _point(y, a), _point(x, b), _point(y, b), _point(x, c), _point(y, c), entering
+                    p0, p1, point(x, a), point(y, a), point(x, b), point(y, b), point(x, c), point(y, c), entering
                 )
                 if t < first or (t == first and t <= 1.0 and order[e] < which):
                     first, which, where = t, order[e], s
                     u, v, w = weight
         found[q], side[q] = which, where
         weights[q, 0], weights[q, 1], weights[q, 2] = u, v, w
-
-
-@inline
-def _point(x, v):
-    return x[v, 0], x[v, 1], x[v, 2]
 
 
 @inline

@@ -19,12 +19,14 @@ from pbng.contact.crossing import first_crossings
 from pbng.contact.queries import closest_triangles
 from pbng.errors import InputError
 from pbng.mesh import Mesh, triangle_areas
-from pbng.topology import TRIANGLE_EDGES
+from pbng.topology import TRIANGLE_EDGES, components, edge_sides
 
 PIECES = 16  # straight pieces at most that a step of a deforming mesh is cut into
 BEND = 0.1  # of an edge, or the thickness: how far vertices may stray from straight pieces
 CORNER = 1e-9  # weight below which a point of a triangle is on its edge
 TINY = 1e-9  # of the size: distances that give no direction
+FLAT = 1e-12  # of the area to the power of 3/2: a volume that is none
+OFF = 1e-6  # of the size of a triangle: how far off it to stand for what a part encloses
 
 
 class _Shape:
@@ -95,8 +97,9 @@ class Kinematic(Collider):
     mean. A surface with boundary edges is a sheet with two sides, and needs a thickness.
 
     Raises:
-        InputError: The surface is inside-out; an edge belongs to more than two triangles; neighbours are oriented
-            against each other; it is open and has no thickness; the motion does not fit the mesh.
+        InputError: The surface, or a part of it that is no cavity, is inside-out, at rest or at the end of its motion;
+            an edge belongs to more than two triangles; neighbours are oriented against each other; it is open and has
+            no thickness; the motion does not fit the mesh.
     """
 
     mesh: Mesh
@@ -112,18 +115,34 @@ class Kinematic(Collider):
                 f"{self.label}: the surface is open, with {len(boundary)} boundary edges, the first from vertex {a} to"
                 f" {b}; a sheet needs a thickness above 0"
             )
-        volume = _volume(self._rest)
-        if self.closed and not volume > 0:
-            raise InputError(
-                f"{self.label}: the surface is inside-out: its signed volume is {volume:.3g} m³; reverse its triangles"
-            )
+        if self.closed:
+            self._check_inside(self._rest, "", "reverse its triangles")
+        if self.closed and not self._rigid:  # a function of time has no end: it is looked at where it begins
+            when = f" at the end of the motion, {self.end:g} s"
+            self._check_inside(self._shape(self.end), when, "the motion must not turn it over or flatten it")
 
     def _check_motion(self) -> None:
         assert self.motion is not None
         try:
-            self.motion.at(self.mesh.X, self._center, self.share(self.start), self.start)
+            for t in (self.start, self.end):
+                self.motion.at(self.mesh.X, self._center, self.share(t), t)
         except InputError as error:
             raise InputError(f"{self.label}: {error}") from error
+
+    def _check_inside(self, shape: _Shape, when: str, remedy: str) -> None:
+        """InputError if a closed surface, or a part of it, has its outside where its inside should be."""
+        bad = _inside_out(shape)
+        if bad is None:
+            return
+        triangles, volume = bad
+        what, why = "the surface", ""
+        if len(triangles) < len(shape.triangles):
+            vertex = self._used[shape.triangles[triangles[0], 0]]
+            what = f"the part of {len(triangles)} triangles that vertex {vertex} belongs to"
+            why = ", and it is no cavity of another"
+        raise InputError(
+            f"{self.label}: {what} is inside-out{when}: its signed volume is {volume:.3g} m³{why}; {remedy}"
+        )
 
     @cached_property
     def closed(self) -> bool:
@@ -310,17 +329,17 @@ def _meeting(path: list[np.ndarray], margin: np.ndarray, shapes: list[_Shape]) -
 
 def _neighbors(label: str, triangles: np.ndarray) -> np.ndarray:
     """Across each edge of triangles (m, 3) the neighbour, -1 for none, (m, 3); InputError where there is no surface."""
-    pairs = triangles[:, TRIANGLE_EDGES].reshape(-1, 2)
-    edges, edge, count = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(edge.ravel(), kind="stable")
-    begin = np.cumsum(count) - count
+    edges, start, sides = edge_sides(triangles)
+    count = np.diff(start)
     if (count > 2).any():
         k = int(np.flatnonzero(count > 2)[0])
-        owners = (order[begin[k] : begin[k] + count[k]] // 3).tolist()
+        owners = (sides[start[k] : start[k + 1]] // 3).tolist()
         raise InputError(
             f"{label}: edge {edges[k].tolist()} belongs to {count[k]} triangles, {owners}; a surface has one or two"
         )
-    i, j = order[begin[count == 2]], order[begin[count == 2] + 1]
+    first = start[:-1][count == 2]
+    i, j = sides[first], sides[first + 1]
+    pairs = triangles[:, TRIANGLE_EDGES].reshape(-1, 2)
     against = np.flatnonzero(pairs[i, 0] == pairs[j, 0])
     if len(against):
         k = against[0]
@@ -333,10 +352,35 @@ def _neighbors(label: str, triangles: np.ndarray) -> np.ndarray:
     return neighbor.reshape(-1, 3)
 
 
-def _volume(shape: _Shape) -> float:
-    """Signed volume that a closed surface bounds [m³]."""
-    a, b, c = (shape.x - shape.x.mean(0))[shape.triangles].transpose(1, 0, 2)
-    return float(np.einsum("mi,mi->", a, np.cross(b, c)) / 6)
+def _inside_out(shape: _Shape) -> tuple[np.ndarray, float] | None:
+    """Of a closed surface a part that hangs together and bounds no inside: its triangles and its signed volume [m³].
+
+    None if there is no such part. Cavities are none: their volume is negative, but the others wind about them.
+    """
+    n, corners = len(shape.triangles), shape.x[shape.triangles]
+    part = components(np.column_stack([np.arange(n), shape.neighbor]).astype(np.int32), n)  # across edges alone
+    first = np.unique(part, return_index=True)[1]
+    across = triangle_areas(shape.x, shape.triangles)
+    size = norms(across)
+    a, b, c = (corners - corners[first[part], :1]).transpose(1, 0, 2)
+    volume, area = np.bincount(part, np.einsum("mi,mi->m", a, np.cross(b, c))) / 6, np.bincount(part, size)
+    least = FLAT * area**1.5
+    for k in np.flatnonzero(~(volume > least)):
+        mine = part == k
+        t = np.where(mine, size, -1.0).argmax()
+        inside = corners[t].mean(0) + OFF / math.sqrt(max(size[t], 1e-300)) * across[t]  # of the part, were it a cavity
+        if not volume[k] < -least[k] or _winding(corners[~mine] - inside) < 0.5:
+            return np.flatnonzero(mine), float(volume[k])
+    return None
+
+
+def _winding(corners: np.ndarray) -> float:
+    """How often closed triangles (m, 3, 3) wind about the origin, by the solid angle of each (Van Oosterom, 1983)."""
+    a, b, c = corners.transpose(1, 0, 2)
+    la, lb, lc = norms(a), norms(b), norms(c)
+    ab, bc, ca = ((p * q).sum(1) for p, q in ((a, b), (b, c), (c, a)))
+    half = np.arctan2((a * np.cross(b, c)).sum(1), la * lb * lc + ab * lc + bc * la + ca * lb)
+    return float(half.sum()) / (2 * math.pi)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

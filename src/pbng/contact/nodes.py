@@ -32,6 +32,7 @@ from pbng.packing import NODAL, Packed
 from pbng.parallel import array, body, rows, run, scratch
 from pbng.problem import Problem
 from pbng.sweep import aligned_part
+from pbng.topology import entries
 
 HELD = 1e30  # diagonal of the Hessian of a node that is swept elsewhere: it does not move
 ROUNDS = 8  # of multipliers of a node with several contacts
@@ -138,8 +139,7 @@ class ContactNodes:
         lanes, per_lane = self.owner[self.real], np.zeros(len(self.real), np.int64)
         per_lane[self.real] = count[lanes]
         self.first = np.concatenate([[0], np.cumsum(per_lane)])
-        at = np.repeat(first[lanes], count[lanes]) + _counting(count[lanes])
-        taken = order[at]
+        taken = order[entries(first, lanes)[1]]
         self.other, self.row = np.ascontiguousarray(other[taken]), np.ascontiguousarray(row[taken], dtype)
         self.force, self.creep = np.zeros(len(taken), dtype), c.creep
 
@@ -154,12 +154,6 @@ class ContactNodes:
         forward = np.arange(len(self.color_start) - 1)
         colors = np.concatenate([forward, forward[::-1]]) if symmetric else forward
         run(blocks, arrays, colors, self.color_start, 4)
-
-
-def _counting(count: np.ndarray) -> np.ndarray:
-    """0 .. count[0] - 1, 0 .. count[1] - 1, ..."""
-    end = np.cumsum(count)
-    return np.arange(end[-1] if len(end) else 0) - np.repeat(end - count, count)
 
 
 def _neighbours(problem: Problem, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

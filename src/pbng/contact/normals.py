@@ -7,10 +7,10 @@ and of two surfaces that meet vertex upon vertex, or edge upon edge, contacts wo
 import numpy as np
 
 from pbng.contact.rings import neighbourhoods
-from pbng.jit import inline
-from pbng.linalg import add, cross, dot, scale, sub
+from pbng.linalg import add, cross, point, scale, sub, unit
 from pbng.mesh import triangle_areas
 from pbng.parallel import array, body, each, rows
+from pbng.topology import entries
 
 CREASE = 0.9  # cosine of the angle between normals at rest, below which one triangle does not count for the other's
 
@@ -28,16 +28,14 @@ class SmoothNormals:
     def __init__(self, X: np.ndarray, triangles: np.ndarray) -> None:
         self.triangles = np.ascontiguousarray(triangles, np.int32)
         first, around = neighbourhoods(self.triangles, len(X), 1)
-        corner = self.triangles.ravel()
-        count = np.diff(first)[corner]
-        at = np.arange(count.sum()) + np.repeat(first[corner] - np.cumsum(count) + count, count)
-        owner, other = np.repeat(np.arange(len(corner)), count), around[at]
+        owner, at = entries(first, self.triangles.ravel())
+        other = around[at]
         normal = triangle_areas(X, self.triangles)
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
         near = (normal[owner // 3] * normal[other]).sum(1) > CREASE
         near |= owner // 3 == other  # a triangle of no area has no normal
         self.ids = other[near]
-        self.start = np.concatenate([[0], np.cumsum(np.bincount(owner[near], minlength=len(corner)))])
+        self.start = np.concatenate([[0], np.cumsum(np.bincount(owner[near], minlength=self.triangles.size))])
 
     def at(self, x: np.ndarray, triangle: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Unit normals (k, 3) at points of triangles (k,), given by their weights (k, 3), at positions x (n_vert, 3).
@@ -67,18 +65,7 @@ def _interpolate(arguments, low, high):
             around = 0.0, 0.0, 0.0
             for i in range(start[corner], start[corner + 1]):
                 a, b, c = triangles[ids[i], 0], triangles[ids[i], 1], triangles[ids[i], 2]
-                p = _point(x, a)
-                around = add(around, cross(sub(_point(x, b), p), sub(_point(x, c), p)))
-            n = add(n, scale(weights[k, j], _unit(around)))
-        normals[k, 0], normals[k, 1], normals[k, 2] = _unit(n)
-
-
-@inline
-def _point(x, v):
-    return x[v, 0], x[v, 1], x[v, 2]
-
-
-@inline
-def _unit(v):
-    length = dot(v, v) ** 0.5
-    return scale(1.0 / length if length > 0.0 else 0.0, v)
+                p = point(x, a)
+                around = add(around, cross(sub(point(x, b), p), sub(point(x, c), p)))
+            n = add(n, scale(weights[k, j], unit(around)))
+        normals[k, 0], normals[k, 1], normals[k, 2] = unit(n)

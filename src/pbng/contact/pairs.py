@@ -20,7 +20,7 @@ from pbng.contact.rings import neighbourhoods
 from pbng.contact.spec import CLOSE, NEAR, Surfaces
 from pbng.errors import InputError
 from pbng.mesh import triangle_areas
-from pbng.topology import TRIANGLE_EDGES, unique_edges
+from pbng.topology import edge_sides, entries
 
 STIFF = 10.0  # default stiffness, in E h of the softer body
 PUSH = 5.0  # how many edges a second a stiff contact may push apart what overlaps [1/s]
@@ -112,8 +112,8 @@ class SurfaceDetector:
         Of solids those that are sharp at rest: elsewhere vertices find all there is, and which of many crossing edges
         is closest changes with every movement. Of cloth all, as it folds anywhere.
         """
-        edges = unique_edges(self.surfaces.triangles, TRIANGLE_EDGES)
-        beside = _beside(self.surfaces.triangles, edges)
+        edges, start, sides = edge_sides(self.surfaces.triangles)
+        beside = np.column_stack([sides[start[:-1]], sides[start[1:] - 1]]) // 3  # twice the same where there is one
         a, b = (triangle_areas(X, self.surfaces.triangles[t]) for t in beside.T)
         cosine = (a * b).sum(1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
         used = (cosine < SHARP) | ~self.solid[self.body[edges[:, 0]]]
@@ -259,9 +259,8 @@ class SurfaceDetector:
     def _vertex_normals(self, x: np.ndarray, vertex: np.ndarray) -> np.ndarray:
         """Sum of the area vectors of the triangles around vertices, (k, 3)."""
         start, triangle = self.around
-        count = np.diff(start)[vertex]
-        first = np.cumsum(count) - count
-        at = np.arange(count.sum()) + np.repeat(start[vertex] - first, count)
+        of, at = entries(start, vertex)
+        first = np.searchsorted(of, np.arange(len(vertex)))
         return np.add.reduceat(triangle_areas(x, self.surfaces.triangles[triangle[at]]), first)
 
     def _edge_normals(self, x: np.ndarray, edge: np.ndarray) -> np.ndarray:
@@ -328,13 +327,3 @@ class SurfaceDetector:
                     f"contact: body {names[b]!r} starts fully inside body {names[solid]!r} ({len(mine)} vertices);"
                     " move one of them"
                 )
-
-
-def _beside(triangles: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """The two triangles at each edge, (n_edge, 2); twice the same where there is one."""
-    key = edges[:, 0].astype(np.int64) << 32 | edges[:, 1]
-    pairs = np.sort(triangles[:, TRIANGLE_EDGES].reshape(-1, 2).astype(np.int64), axis=1)
-    edge = np.searchsorted(key, pairs[:, 0] << 32 | pairs[:, 1])
-    order = np.argsort(edge, kind="stable")
-    first, last = (np.searchsorted(edge[order], np.arange(len(edges)), side) for side in ("left", "right"))
-    return order[np.column_stack([first, last - 1])] // 3

@@ -18,7 +18,7 @@ import numpy as np
 from pbng.contact.bvh import DEPTH, BoxTree
 from pbng.contact.primitives import closest_on_triangle, closest_segments, tet_weights
 from pbng.jit import inline
-from pbng.linalg import cross, dot, sub
+from pbng.linalg import cross, dot, point, sub
 from pbng.parallel import array, body, each, rows, scratch
 
 GRAIN = 128  # queries that a thread takes at a time
@@ -178,11 +178,6 @@ def _numbers(a: np.ndarray | None, k: int, end: int) -> np.ndarray:
 
 
 @inline
-def _point(x, v):
-    return x[v, 0], x[v, 1], x[v, 2]
-
-
-@inline
 def _gap2(boxes, i, low, high):
     """Squared distance of box i from the box between two corners."""
     dx = max(boxes[i, 0] - high[0], 0.0, low[0] - boxes[i, 3])
@@ -223,6 +218,30 @@ def _is_listed(start, ids, v, t):
     return low < start[v + 1] and ids[low] == t
 
 
+@inline
+def _next_leaf(nodes, boxes, meets, row, low, high, within, stack, gaps, top):
+    """The next leaf on the way, -1 for none, and how many nodes are left on the stack with their squared distances.
+
+    Of nodes that the groups of ``row`` meet, near ones first; none whose box is farther than √within from a box.
+    """
+    while top > 0:
+        top -= 1
+        i, gap = stack[top], gaps[top]
+        while gap <= within and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
+            child = nodes[i, 0]
+            if child < 0:
+                return i, top
+            near, far = _gap2(boxes, child, low, high), _gap2(boxes, child + 1, low, high)
+            i, child = child, child + 1
+            if far < near:
+                i, child, near, far = child, i, far, near
+            if far <= within:
+                stack[top], gaps[top] = child, far
+                top += 1
+            gap = near
+    return -1, top
+
+
 @body
 def _closest_triangles(arguments, low, high):
     """Body of :func:`closest_triangles` for points low .. high."""
@@ -244,49 +263,34 @@ def _closest_triangles(arguments, low, high):
         weights[q, 0] = weights[q, 1] = weights[q, 2] = 0.0
         if not reach[q] >= 0.0:
             continue
-        p = _point(points, q)
+        p = point(points, q)
         row = own[q] * n_group if grouped else 0
         closest = NONE
         u = v = w = 0.0
         best = least = most = np.inf
         within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
-        top, i = 0, 0
-        gap = _gap2(boxes, 0, p, p)
-        while True:
-            if gap <= within and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
-                child = nodes[i, 0]
-                if child >= 0:
-                    near, far = _gap2(boxes, child, p, p), _gap2(boxes, child + 1, p, p)
-                    i, child = child, child + 1
-                    if far < near:
-                        i, child, near, far = child, i, far, near
-                    if far <= within:
-                        stack[top], gaps[top] = child, far
-                        top += 1
-                    gap = near
+        stack[0], gaps[0] = 0, _gap2(boxes, 0, p, p)
+        i, top = _next_leaf(nodes, boxes, meets, row, p, p, within, stack, gaps, 1)
+        while i >= 0:
+            for e in range(nodes[i, 1], nodes[i, 2]):
+                t = order[e]
+                if listed and _is_listed(start, ids, vertex[q], t):
                     continue
-                for e in range(nodes[i, 1], nodes[i, 2]):
-                    a, b, c = _point(x, cells[e, 0]), _point(x, cells[e, 1]), _point(x, cells[e, 2])
-                    weight, offset, d2 = closest_on_triangle(p, a, b, c)
-                    t = order[e]
-                    if not d2 <= most or (d2 >= least and t > closest):  # not a number is not found
-                        continue
-                    if d2 > _squared(reach[q] + max(margin[cells[e, 0]], margin[cells[e, 1]], margin[cells[e, 2]])):
-                        continue
-                    if behind and not dot(offset, cross(sub(b, a), sub(c, a))) > 0.0:
-                        continue
-                    if directed and not dot(_point(against, q), cross(sub(b, a), sub(c, a))) <= 0.0:
-                        continue
-                    if listed and _is_listed(start, ids, vertex[q], t):
-                        continue
-                    best, closest = d2, t
-                    u, v, w = weight
-                    least, most = _same(best, slack)
-                    within = min(within, most)
-            if top == 0:
-                break
-            top -= 1
-            i, gap = stack[top], gaps[top]
+                a, b, c = point(x, cells[e, 0]), point(x, cells[e, 1]), point(x, cells[e, 2])
+                weight, offset, d2 = closest_on_triangle(p, a, b, c)
+                if not d2 <= most or (d2 >= least and t > closest):  # not a number is not found
+                    continue
+                if d2 > _squared(reach[q] + max(margin[cells[e, 0]], margin[cells[e, 1]], margin[cells[e, 2]])):
+                    continue
+                if behind and not dot(offset, cross(sub(b, a), sub(c, a))) > 0.0:
+                    continue
+                if directed and not dot(point(against, q), cross(sub(b, a), sub(c, a))) <= 0.0:
+                    continue
+                best, closest = d2, t
+                u, v, w = weight
+                least, most = _same(best, slack)
+                within = min(within, most)
+            i, top = _next_leaf(nodes, boxes, meets, row, p, p, within, stack, gaps, top)
         if closest < NONE:
             found[q], distance[q] = closest, sqrt(best)
             weights[q, 0], weights[q, 1], weights[q, 2] = u, v, w
@@ -311,7 +315,7 @@ def _closest_edges(arguments, low, high):
         if not reach[q] >= 0.0:
             continue
         v, w = edges[q, 0], edges[q, 1]
-        a, b = _point(x, v), _point(x, w)
+        a, b = point(x, v), point(x, w)
         lowest = min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2])
         highest = max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2])
         row = own[q] * n_group if grouped else 0
@@ -319,40 +323,25 @@ def _closest_edges(arguments, low, high):
         along, across = 0.0, 0.0
         best = least = most = np.inf
         within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
-        top, i = 0, 0
-        gap = _gap2(boxes, 0, lowest, highest)
-        while True:
-            if gap <= within and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
-                child = nodes[i, 0]
-                if child >= 0:
-                    near, far = _gap2(boxes, child, lowest, highest), _gap2(boxes, child + 1, lowest, highest)
-                    i, child = child, child + 1
-                    if far < near:
-                        i, child, near, far = child, i, far, near
-                    if far <= within:
-                        stack[top], gaps[top] = child, far
-                        top += 1
-                    gap = near
+        stack[0], gaps[0] = 0, _gap2(boxes, 0, lowest, highest)
+        i, top = _next_leaf(nodes, boxes, meets, row, lowest, highest, within, stack, gaps, 1)
+        while i >= 0:
+            for e in range(nodes[i, 1], nodes[i, 2]):
+                c, d = cells[e, 0], cells[e, 1]
+                if c == v or c == w or d == v or d == w:  # noqa: SIM109 (a tuple would be searched)
                     continue
-                for e in range(nodes[i, 1], nodes[i, 2]):
-                    c, d = cells[e, 0], cells[e, 1]
-                    if c == v or c == w or d == v or d == w:  # noqa: SIM109 (a tuple would be searched)
-                        continue
-                    s1, t1, _, d2 = closest_segments(a, b, _point(x, c), _point(x, d))
-                    edge = order[e]
-                    if not d2 <= most or (d2 >= least and edge > closest):
-                        continue
-                    if d2 > _squared(reach[q] + max(margin[c], margin[d])):
-                        continue
-                    if listed and (_is_listed(start, ids, v, edge) or _is_listed(start, ids, w, edge)):
-                        continue
-                    best, closest, along, across = d2, edge, s1, t1
-                    least, most = _same(best, slack)
-                    within = min(within, most)
-            if top == 0:
-                break
-            top -= 1
-            i, gap = stack[top], gaps[top]
+                s1, t1, _, d2 = closest_segments(a, b, point(x, c), point(x, d))
+                edge = order[e]
+                if not d2 <= most or (d2 >= least and edge > closest):
+                    continue
+                if d2 > _squared(reach[q] + max(margin[c], margin[d])):
+                    continue
+                if listed and (_is_listed(start, ids, v, edge) or _is_listed(start, ids, w, edge)):
+                    continue
+                best, closest, along, across = d2, edge, s1, t1
+                least, most = _same(best, slack)
+                within = min(within, most)
+            i, top = _next_leaf(nodes, boxes, meets, row, lowest, highest, within, stack, gaps, top)
         if closest < NONE:
             found[q], s[q], t[q], distance[q] = closest, along, across, sqrt(best)
 
@@ -365,49 +354,34 @@ def _containing_tets(arguments, low, high):
     reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
     own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
     start, ids = array(arguments, 10, np.int64), array(arguments, 11, np.int32)
-    points, numbers, found = (
-        rows(arguments, 13, 3, np.float64),
-        array(arguments, 14, np.int64),
-        array(arguments, 15, np.int32),
-    )
-    weights = rows(arguments, 16, 4, np.float64)
-    grouped, n_group, listed, named = sizes[0], sizes[1], sizes[2], numbers[0]
-    stack = scratch(DEPTH, np.int32)
+    points, named = rows(arguments, 13, 3, np.float64), array(arguments, 14, np.int64)[0]
+    found, weights = array(arguments, 15, np.int32), rows(arguments, 16, 4, np.float64)
+    grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
+    stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
     for q in range(low, high):
         found[q] = -1
         weights[q, 0] = weights[q, 1] = weights[q, 2] = weights[q, 3] = 0.0
         if not reach[q] >= 0.0:
             continue
-        p = _point(points, q)
+        p = point(points, q)
         row = own[q] * n_group if grouped else 0
         v = vertex[q] if named else -1
         lowest = NONE
-        stack[0], top = 0, 1
-        while top > 0:
-            top -= 1
-            i = stack[top]
-            if nodes[i, 3] >= 0 and not meets[row + nodes[i, 3]]:
-                continue
-            child = nodes[i, 0]
-            if child >= 0:
-                if _gap2(boxes, child + 1, p, p) <= 0.0:
-                    stack[top] = child + 1
-                    top += 1
-                if _gap2(boxes, child, p, p) <= 0.0:
-                    stack[top] = child
-                    top += 1
-                continue
+        stack[0], gaps[0] = 0, 0.0
+        i, top = _next_leaf(nodes, boxes, meets, row, p, p, 0.0, stack, gaps, 1)
+        while i >= 0:
             for e in range(nodes[i, 1], nodes[i, 2]):
                 t = order[e]
                 a, b, c, d = cells[e, 0], cells[e, 1], cells[e, 2], cells[e, 3]
                 if t >= lowest or a == v or b == v or c == v or d == v:
                     continue
-                (wa, wb, wc, wd), _ = tet_weights(p, _point(x, a), _point(x, b), _point(x, c), _point(x, d))
+                (wa, wb, wc, wd), _ = tet_weights(p, point(x, a), point(x, b), point(x, c), point(x, d))
                 if not (wa >= 0.0 and wb >= 0.0 and wc >= 0.0 and wd >= 0.0):
                     continue
                 if listed and _is_listed(start, ids, v, t):
                     continue
                 lowest = t
                 weights[q, 0], weights[q, 1], weights[q, 2], weights[q, 3] = wa, wb, wc, wd
+            i, top = _next_leaf(nodes, boxes, meets, row, p, p, 0.0, stack, gaps, top)
         if lowest < NONE:
             found[q] = lowest

@@ -20,6 +20,7 @@ from pbng.solvers.base import Certificate, norm
 from pbng.solvers.threads import FIRST_PROBE, Threads, check_threads
 from pbng.sweep import sweep
 
+SLACK = 4.0  # how many roundings off its half-space a vertex may be that touches it
 DOUBT = 16.0  # how many roundings an energy may be off by
 
 
@@ -252,13 +253,16 @@ class PackedMethod:
 
     def slack(self, x: np.ndarray) -> float:
         """How far from a half-space a vertex may be that touches it [m]: roundings."""
-        return 4 * self.rounding(x)
+        return SLACK * self.rounding(x)
 
     def floor(self, dtype: Any = None) -> float:
         """Norm of the forces that moving each node by half a unit in the last place of the largest position makes."""
         stiffness = self.stiffness
         if self.touching:
-            stiffness = stiffness + self.touching.stiffness(self._places(self.x), len(stiffness))
+            places = self._places(self.x)
+            stiffness = stiffness + self.touching.stiffness(places, len(stiffness))
+            held = self.touching.vertex[self.touching.held(places, self.slack(self.x))]
+            stiffness[held[held < len(stiffness)]] *= SLACK
         return self.rounding(self.x, dtype) * float(np.linalg.norm(stiffness))
 
     def noise(self, x: np.ndarray, energy: float) -> float:

@@ -3,10 +3,10 @@
 import numpy as np
 from numba import uint64
 
+from pbng.blocks import BlockMatrix
 from pbng.jit import inline
 from pbng.linalg import adjugate, scale
 from pbng.parallel import array, body, each, rows, run
-from pbng.stiffness import BlockMatrix
 
 SINGULAR = 1e-12  # determinant of a block, relative to the cube of its largest diagonal entry, that counts as zero
 _1, _2, _3, _4, _5, _6, _7, _8, _9 = (uint64(n) for n in range(1, 10))
