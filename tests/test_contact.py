@@ -1,14 +1,18 @@
-"""Contact in the sweep: energy, forces, momentum, colours."""
+"""Contact in the sweep: energy, forces, Hessian, momentum, colours."""
+
+from dataclasses import replace
 
 import numba
 import numpy as np
 import pytest
 import scipy.optimize
+import scipy.sparse
 
 import pbng
 from pbng.contact.contacts import ContactEnergy, Contacts
 from pbng.contact.detection import Detector
 from pbng.solvers.acceleration import NodeSOR
+from pbng.solvers.loop import run
 
 SOFT = pbng.Corotated(E=1e3, nu=0.3, density=10.0)
 
@@ -26,10 +30,13 @@ def two_blocks(n=5, gap=0.02, turn=0.0, **rule):
 
 
 def in_contact(seed=0, squeeze=0.1, k_tau=0.0, n=4):
-    """A problem, a state in which its blocks overlap and are crumpled, and the contacts there."""
+    """A problem, a state in which its blocks overlap and are crumpled, and the contacts there.
+
+    Twenty vertices, of which ten are in no other contact, have one to four half-spaces each, in all directions, with
+    friction, and have slid by some centimetres.
+    """
     scene, lower = two_blocks(n, k_tau=k_tau, turn=0.3)
     scene.pin(lower.where(y=0))
-    scene.collide_with(pbng.Plane((0, 0.05, 0), (0, 1, 0)))
     problem = scene.compile()
     rng = np.random.default_rng(seed)
     x = problem.X + 0.05 / n * rng.normal(size=problem.X.shape)
@@ -38,13 +45,33 @@ def in_contact(seed=0, squeeze=0.1, k_tau=0.0, n=4):
     x = problem.constrain(x, 0)
     contacts = Detector(problem.contact, problem.X, problem.fixed).find(x, x, 0, 0)
     assert len(contacts.vertices) > 20
+    free = problem.contact.surface[~problem.fixed[problem.contact.surface]]
+    parts = [free[np.isin(free, contacts.vertices, invert=i)] for i in (False, True)]
+    vertex = np.concatenate([rng.choice(part, 10, replace=False) for part in parts])
+    vertex = np.repeat(vertex, 1 + np.arange(20) % 4).astype(np.int32)
+    plane = rng.normal(size=(len(vertex), 3))
+    plane /= np.linalg.norm(plane, axis=1)[:, None]
+    contacts = replace(
+        contacts,
+        vertex=vertex,
+        plane=plane,
+        level=(plane * x[vertex]).sum(1) - 0.02 * np.abs(rng.normal(size=len(vertex))),
+        friction=5.0 * rng.random(len(vertex)),
+        anchor=x[vertex] + 0.02 * rng.normal(size=plane.shape),
+        creep=1e-3,
+    )
     return problem, x, contacts
+
+
+def energy_of(contacts, problem):
+    """Energy of contacts in the problem's numbering."""
+    return ContactEnergy(contacts, problem.n_vert, np.arange(problem.n_vert), np.zeros(3))
 
 
 @pytest.mark.parametrize("k_tau", [0.0, 30.0])
 def test_forces_are_the_slope_of_the_energy(k_tau):
     problem, x, contacts = in_contact(k_tau=k_tau)
-    energy = ContactEnergy(contacts, problem.n_vert, np.arange(problem.n_vert), np.zeros(3))
+    energy = energy_of(contacts, problem)
     assert energy.energy(x) > 0
     f, _ = energy.forces(x)
     rng = np.random.default_rng(1)
@@ -52,7 +79,84 @@ def test_forces_are_the_slope_of_the_energy(k_tau):
         d = rng.normal(size=x.shape)
         slope = (energy.energy(x + 1e-6 * d) - energy.energy(x - 1e-6 * d)) / 2e-6
         assert slope == pytest.approx(-(f * d).sum(), rel=1e-5)
-    assert np.abs(f.sum(0)).max() < 1e-9 * np.abs(f).max()
+    between = energy_of(replace(contacts, friction=0 * contacts.friction), problem).forces(x)[0]
+    assert np.abs(between.sum(0)).max() < 1e-9 * np.abs(between).max()
+
+
+def test_the_hessian_is_the_slope_of_the_forces():
+    """Contacts that resist or did, and friction where nothing has slid yet; touched half-spaces are springs."""
+    problem, x, contacts = in_contact(k_tau=30.0)
+    x[problem.bodies[1].start :, 1] += 0.05
+    contacts = replace(contacts, anchor=x[contacts.vertex])
+    energy, n = energy_of(contacts, problem), problem.n_vert
+    active = energy.active(x, 0.01)
+    resists, held = np.split(active, [len(contacts.vertices)])
+    sticks = contacts.k_tau > 0
+    assert all(some.any() for some in (resists, sticks & ~resists, ~sticks, held, ~held))
+    bearing = np.random.default_rng(1).uniform(1e6, 2e6, n)  # more than friction is stiff
+    H = energy.hessian(x, active, bearing, scipy.sparse.identity(n, format="csr"))
+    assert abs(H - H.T).max() < 1e-9 * abs(H).max()
+    touched = energy_of(replace(contacts, friction=contacts.friction * held), problem)
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        d = rng.normal(size=x.shape)
+        slope = (touched.forces(x - 1e-7 * d)[0] - touched.forces(x + 1e-7 * d)[0]) / 2e-7
+        v, p = contacts.vertex[held], contacts.plane[held]
+        np.add.at(slope, v, (bearing[v] * (p * d[v]).sum(1))[:, None] * p)
+        assert np.abs(H @ d.ravel() - slope.ravel()).max() < 1e-5 * np.abs(slope).max()
+    k = n - 7  # of the first k positions, interpolated
+    U = scipy.sparse.random(k, 12, density=0.3, format="csr", rng=3)
+    coarse = energy.hessian(x, active, bearing, U)
+    lifted = scipy.sparse.kron(U, np.eye(3)).tocsr()
+    wanted = lifted.T @ H.tocsr()[: 3 * k, : 3 * k] @ lifted
+    assert abs(coarse - wanted).max() < 1e-12 * abs(wanted).max()
+    # Friction that is stiffer than the half-space counts as stiff as that.
+    soft = energy.hessian(x, active, np.full(n, 1.0), scipy.sparse.identity(n, format="csr"))
+    alone = np.setdiff1d(contacts.vertex[held], contacts.vertices)
+    for v in alone:
+        block = soft.tocsr()[3 * v : 3 * v + 3, 3 * v : 3 * v + 3].toarray()
+        np.testing.assert_allclose(block, np.sum(contacts.vertex[held] == v) * np.eye(3), atol=1e-12)
+
+
+def test_closing_forces_are_at_rest_where_gaps_are_closed():
+    """Of one contact and one half-space that are open: the springs of the Hessian take them to a gap of zero."""
+    problem, x, contacts = in_contact()
+    energy, n, m = energy_of(contacts, problem), problem.n_vert, len(contacts.vertices)
+    bearing = np.random.default_rng(1).uniform(1e3, 2e3, n)
+    gap = contacts.clearance(x)
+    contact, wall = int(gap.argmax()), int(np.argmax(~np.isin(contacts.vertex, contacts.vertices)))
+    assert gap[contact] > 0
+    free = energy_of(replace(contacts, friction=0 * contacts.friction), problem)
+    for k in (contact, m + wall):
+        active = np.arange(m + len(contacts.vertex)) == k
+        d = np.zeros_like(x)
+        if k < m:
+            w = contacts.weights[k]
+            d[contacts.vertices[k]] = -gap[k] / (w @ w) * w[:, None] * contacts.normal[k]
+            assert replace(contacts, kept=contacts.offset).clearance(x + d)[k] == pytest.approx(0, abs=1e-12)
+        else:
+            v, p = contacts.vertex[wall], contacts.plane[wall]
+            d[v] = (contacts.level[wall] - p @ x[v]) * p
+            assert p @ d[v] < 0
+        H = free.hessian(x, active, bearing, scipy.sparse.identity(n, format="csr"))
+        f = free.closing(x, active, bearing)
+        assert np.abs(f).max() > 0
+        np.testing.assert_allclose((H @ d.ravel()).reshape(-1, 3), f, atol=1e-9 * np.abs(f).max())
+    closed = np.concatenate([gap < 0, np.zeros(len(contacts.vertex), bool)])
+    assert closed.any()
+    assert (energy.closing(x, closed, bearing) == 0).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sweeps_come_to_rest_where_forces_do(seed):
+    """Contacts, what sticks and rubs, and corners of several half-spaces: kernel and certificate mean the same."""
+    problem, x, contacts = in_contact(seed, k_tau=30.0)
+    method = pbng.PBNG(NodeSOR(1.5), dtype="float64").set_up(problem)
+    result = run(method, contacts.put_outside(x), pbng.Budget(rtol=1e-8, iterations=1000), contacts=contacts)
+    assert result.status is pbng.Status.CONVERGED
+    height = (contacts.plane * result.x[contacts.vertex]).sum(1) - contacts.level
+    assert height.min() > -1e-9
+    assert (height < 1e-9).sum() > 5
 
 
 @pytest.mark.parametrize("omega", [1.0, 1.5, 1.9])
@@ -62,12 +166,19 @@ def test_energy_never_rises_with_contacts(omega, seed):
     method = pbng.PBNG(NodeSOR(omega), dtype="float64").set_up(problem)
     method.start(contacts.put_outside(x), contacts=contacts)
     energies = [method.energy(method.x)]
+    _, at, count = np.unique(contacts.vertex, return_inverse=True, return_counts=True)
+    single = (count[at] == 1) & ~np.isin(contacts.vertex, contacts.vertices)  # these hold at once
+    assert single.sum() > 1
     for _ in range(20):
         method.step()
         energies.append(method.energy(method.x))
+        height = (contacts.plane * method.state()[contacts.vertex]).sum(1) - contacts.level
+        assert height[single].min() > -1e-12
     assert method.touching.energy(method.x.reshape(-1, 4)[:, :3]) > 0
     assert np.all(np.diff(energies) <= 1e-12 * abs(energies[0]))
     assert energies[-1] < energies[0]
+    assert height.min() > -1e-3
+    assert (height < 1e-6).sum() > 5
 
 
 def test_a_node_moves_to_the_minimum_of_what_it_sees():
@@ -112,6 +223,8 @@ def test_colors_are_valid_and_kept():
     method.start(contacts.put_outside(x), contacts=contacts)
     method.step()
     nodes = method.contact_nodes["float64"]
+    found = np.union1d(contacts.vertices, contacts.vertex)
+    assert np.array_equal(nodes.node, found[~problem.fixed[found]])
     among = np.zeros(problem.n_vert, bool)
     among[nodes.node] = True
     color = np.where(among, nodes.color, -1)
@@ -124,6 +237,16 @@ def test_colors_are_valid_and_kept():
     method.start(contacts.put_outside(x), contacts=Contacts(**vars(contacts)))
     assert np.array_equal(before, nodes.color)
     assert nodes.repacked == repacked
+
+
+def test_a_node_that_meets_many_colors_gets_a_free_one():
+    """More than there are bits in a word: 0 to 63 around it, and 64 in a contact."""
+    n = 66
+    color = np.append(np.arange(65), 5).astype(np.int32)
+    start = np.append(np.zeros(n), 64).astype(np.int64)
+    stencils = np.array([[65, 64, 0, 1]], np.int32)
+    pbng.coloring.recolor(np.array([65]), color, start, np.arange(64), stencils, np.ones(n, bool))
+    assert color.tolist() == [*range(65), 65]
 
 
 def test_contact_between_free_bodies_keeps_momentum():
@@ -168,18 +291,6 @@ def test_stacked_blocks_come_to_rest_and_bear_their_weight():
     assert f[upper, 1].sum() == pytest.approx(100.0 * 9.8, rel=0.02)
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.2, 0.5])
-def test_a_block_slides_down_a_slope_as_coulomb_says(friction):
-    slope = np.deg2rad(20)
-    scene = pbng.Scene(gravity=(9.8 * np.sin(slope), -9.8 * np.cos(slope), 0))
-    scene.add(pbng.shapes.box((1.0, 1.0, 1.0), 4), pbng.Corotated(E=1e5, nu=0.3, density=100.0))
-    scene.collide_with(pbng.Plane((0, 0, 0), (0, 1, 0), friction=friction))
-    frames = list(pbng.simulate(scene, pbng.PBNG(), pbng.Budget(rtol=1e-4), frames=41, inertia=True))
-    speed = (frames[-1].momentum[0] - frames[-16].momentum[0]) / 100.0
-    wanted = max(9.8 * (np.sin(slope) - friction * np.cos(slope)), 0.0) * 0.5
-    assert speed == pytest.approx(wanted, abs=0.05 * 9.8 * 0.5)
-
-
 def test_what_starts_inside_comes_out():
     scene, lower = two_blocks(4, gap=-0.2)
     scene.pin(lower.where(y=0))
@@ -189,30 +300,6 @@ def test_what_starts_inside_comes_out():
     assert depth[-1] < 0.02
     assert frames[-1].result.inverted == 0
     assert np.abs(frames[-1].v).max() < 2.0
-
-
-def test_a_thickness_that_leaves_rest_no_room_is_refused():
-    def sheet(thickness, rings):
-        scene = pbng.Scene()
-        cloth = scene.add(pbng.shapes.sheet((1.0, 1.0), 11), pbng.Membrane(E=1.0, nu=0.3), name="sheet")
-        scene.pin(cloth.where(x=0))
-        scene.contact(self_collision=True, thickness=thickness, rings=rings)
-        problem = scene.compile()
-        return Detector(problem.contact, problem.X, problem.fixed).find(problem.X, problem.X, 0, 0)
-
-    assert (sheet(0.06, 1).clearance(pbng.shapes.sheet((1.0, 1.0), 11).X) > 0).all()
-    sheet(0.1, 2)
-    with pytest.raises(pbng.InputError, match=r"'sheet' keeps 0.1 m from itself.* is 0.07071 m from a triangle"):
-        sheet(0.1, 1)
-
-
-def test_a_body_that_starts_inside_another_is_refused():
-    scene = pbng.Scene()
-    scene.add(pbng.shapes.box((1.0, 1.0, 1.0), 4), SOFT, name="out")
-    scene.add(pbng.shapes.box((0.2, 0.2, 0.2), 3), SOFT, name="in", at=(0.4, 0.4, 0.4))
-    scene.contact()
-    with pytest.raises(pbng.InputError, match="'in' starts fully inside body 'out'"):
-        next(pbng.simulate(scene, frames=1, inertia=True))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -230,42 +317,3 @@ def test_the_same_bits_for_any_number_of_threads(dtype):
     assert one.contact.pairs > 0
     assert np.array_equal(one.x, two.x)
     assert np.array_equal(one.v, two.v)
-
-
-@pytest.mark.parametrize(
-    ("rule", "said"),
-    [
-        ({"k_n": 0.0}, "k_n must be positive and finite"),
-        ({"radius": -1.0}, "radius must be positive and finite"),
-        ({"k_tau": -1.0}, "k_tau must be finite and not negative"),
-        ({"rings": 0}, "rings must be a whole number"),
-    ],
-)
-def test_bad_rules(rule, said):
-    with pytest.raises(pbng.InputError, match=said):
-        two_blocks(3, **rule)
-
-
-def test_a_plane_body_has_no_surface():
-    scene = pbng.Scene()
-    flat = scene.add(pbng.shapes.rectangle((1.0, 1.0), 4), SOFT, name="flat")
-    with pytest.raises(pbng.InputError, match="'flat' has no surface"):
-        scene.contact(self_collision=[flat])
-    scene.contact(self_collision=True)
-    with pytest.raises(pbng.InputError, match="'flat' has no surface"):
-        scene.compile(free=True)
-    with pytest.raises(pbng.InputError, match="called twice"):
-        scene.contact()
-
-
-def test_only_colliders_collide():
-    with pytest.raises(pbng.InputError, match="expected a collider such as Plane"):
-        pbng.Scene().collide_with([pbng.Plane((0, 0, 0), (0, 1, 0)), 3])
-
-
-def test_other_methods_say_that_they_know_no_contact():
-    scene, _ = two_blocks(3)
-    problem = scene.compile(free=True)
-    for solver in (pbng.Newton(), pbng.XPBD(), pbng.PBD()):
-        with pytest.raises(pbng.InputError, match="knows nothing of contact"):
-            solver.set_up(problem)

@@ -46,7 +46,7 @@ def test_cycles_do_not_grow_with_the_mesh_in_contact(friction):
 
 @pytest.mark.parametrize("n", [5, 9, 13])
 def test_cycles_of_a_stack(n):
-    """Vertices lie upon vertices and on edges, where the closest triangle changes with every movement: rounds settle."""
+    """Vertices lie on vertices and edges, where the closest triangle changes with every movement: rounds settle."""
     frames = list(pbng.simulate(stacked(n), pbng.MultigridPBNG(), pbng.Budget(rtol=1e-3), frames=8))
     assert all(f.result.status is pbng.Status.CONVERGED for f in frames)
     assert frames[-1].contact.pairs > 10
@@ -54,14 +54,18 @@ def test_cycles_of_a_stack(n):
     assert max(f.result.iterations for f in frames) <= 16
 
 
-@pytest.mark.parametrize("scene", [squeezed(9), squeezed(9, 0.3), stacked(6)], ids=["ball", "rough plates", "stack"])
-def test_the_error_estimate_is_true_in_contact(scene):
-    budget = pbng.Budget(rtol=1e-3)
-    rough = pbng.solve(scene, pbng.MultigridPBNG(), budget)
-    fine = pbng.solve(scene, pbng.PBNG(dtype="float64"), pbng.Budget(rtol=1e-9, iterations=20000), start=rough.x)
+@pytest.mark.parametrize(
+    ("scene", "ratio"),
+    [(squeezed(9), 10.7), (squeezed(9, 0.3), 28.9), (stacked(5), 1.27)],
+    ids=["ball", "rough plates", "stack"],
+)
+def test_the_error_estimate_is_true_in_contact(scene, ratio):
+    """It is not too low, and too high, as measured, only where a round may move more than is left to be moved."""
+    rough = pbng.solve(scene, pbng.MultigridPBNG(), pbng.Budget(rtol=1e-3))
+    fine = pbng.solve(scene, pbng.PBNG(dtype="float64"), pbng.Budget(rtol=1e-7))
+    assert fine.status is pbng.Status.CONVERGED
     error = np.linalg.norm(rough.x - fine.x, axis=1).max()
-    assert error <= 3 * rough.error
-    assert rough.error < 0.1
+    assert 0.5 * ratio <= rough.error / error <= 2 * ratio
 
 
 def test_the_same_bits_for_any_number_of_threads():

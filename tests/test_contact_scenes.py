@@ -64,28 +64,91 @@ def test_cloth_catches_a_ball_and_both_pull_alike():
     assert speed < 0.5
 
 
+def crossings(x, triangles, edges):
+    """How many times an edge passes through a triangle that it shares no vertex with, at x (n, 3)."""
+    corners = x[triangles].transpose(1, 0, 2)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    side = x @ normal.T - (corners[0] * normal).sum(1)
+    p, q = side[edges[:, 0]], side[edges[:, 1]]
+    apart = (edges[:, :, None, None] != triangles).all((1, 3))
+    e, t = np.nonzero((p * q < 0) & apart)
+    share = p[e, t] / (p[e, t] - q[e, t])
+    hit = x[edges[e, 0]] + share[:, None] * (x[edges[e, 1]] - x[edges[e, 0]])
+    inside = np.ones(len(e), bool)
+    for a, b in zip(corners, np.roll(corners, -1, axis=0)):
+        inside &= (np.cross(b[t] - a[t], hit - a[t]) * normal[t]).sum(1) > 0
+    return int(inside.sum())
+
+
+def test_crossings_are_counted():
+    x = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [0.2, 1, 0.2], [0.2, -1, 0.2], [0.9, 1, 0.9]])
+    edges = np.array([[3, 4], [5, 4], [5, 3], [0, 1]])
+    assert [crossings(x, np.array([[0, 1, 2]]), edges[[k]]) for k in range(4)] == [1, 0, 0, 0]
+
+
 def test_cloth_does_not_pass_through_itself():
-    """A sheet is folded over by its edge, and lies on itself."""
+    """A sheet is folded over by its edge, which comes to lie 3 cm above the other, and lies on itself."""
     scene = pbng.Scene(gravity=(0, -9.8, 0))
     sheet = pbng.shapes.sheet((1.0, 0.4), (26, 11))
     cloth = scene.add(sheet, pbng.Membrane(E=500.0, nu=0.3, density=0.2), pbng.Bending(k=1e-4), name="cloth")
     low, high = sheet.X[:, 0].min(), sheet.X[:, 0].max()
     scene.pin(cloth.where(x=low))
-    middle = [(low + high) / 2, sheet.X[0, 1], 0.0]
+    middle = [(low + high) / 2, sheet.X[0, 1] + 0.015, 0.0]
     turn = pbng.Rotate("z", 0.5, center=middle)
     scene.move(cloth.where(x=high), turn, over=0.5, until=0.6)
     scene.collide_with(pbng.Plane((0, sheet.X[0, 1] - 0.02, 0), (0, 1, 0)))
     scene.contact(self_collision=True)
     frames = list(pbng.simulate(scene, pbng.PBNG(), pbng.Budget(iterations=30), frames=40, inertia=True, substeps=4))
     last = frames[-1]
-    assert last.contact.pairs > 20
+    assert last.contact.pairs > 100
     kept = last.problem.contact.surfaces.skin[0] * 2
-    assert last.contact.mean < 0.2 * kept
-    assert max(f.contact.deepest for f in frames[1:]) < 1.5 * kept  # where the fold is sharp
+    assert max(f.contact.deepest for f in frames[1:]) < 0.02 * kept
+    assert [crossings(np.asarray(f.x, float), sheet.cells, sheet.edges) for f in frames[::4]] == [0] * 10
     # What was the upper side of the moved half now lies face down on the other half.
     over = cloth.where(x=(high - 0.3, high - 0.1)).vertices
     under = cloth.where(x=(low + 0.1, low + 0.3)).vertices
     assert last.x[over, 1].mean() > last.x[under, 1].mean() + 0.5 * kept
+
+
+def crossed():
+    """Two bars at right angles, each upon an edge, which cross between vertices: the upper's lowest and the lower's
+    highest, of which the middles of both are given."""
+    scene = pbng.Scene()
+    mesh = pbng.shapes.box((1.2, 0.3, 0.3), (6, 2, 2), origin=(-0.6, -0.15, -0.15))
+    c = np.sqrt(0.5)
+    X = mesh.X @ np.array([[1, 0, 0], [0, c, c], [0, -c, c]])
+    lower = scene.add(pbng.TetMesh(X, mesh.cells), RUBBER, name="lower")
+    X = X @ np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    upper = scene.add(pbng.TetMesh(X, mesh.cells), RUBBER, name="upper", at=(0, 0.6 * c + 0.02, 0))
+    scene.pin(lower.where(x=(-0.6, -0.59)))
+    scene.pin(lower.where(x=(0.59, 0.6)))
+    scene.contact()
+    ridge = lower.where(lambda X: (X[:, 1] > 0.2) & (np.abs(X[:, 0]) < 0.2)).index
+    keel = upper.where(lambda X: (X[:, 1] < X[:, 1].min() + 0.01) & (np.abs(X[:, 2]) < 0.2)).index
+    assert len(ridge) == len(keel) == 2
+    return scene, upper, ridge, keel
+
+
+@pytest.mark.parametrize("how", ["dropped", "pressed", "pressed slowly"])
+def test_edges_do_not_pass_through_edges(how):
+    """Vertices would find the other bar's sides only half an edge, 0.12 m, further down."""
+    scene, upper, ridge, keel = crossed()
+    velocity = None
+    if how == "dropped":
+        velocity = np.zeros((2 * upper.start, 3))
+        velocity[upper.start :, 1] = -2.0
+    else:
+        scene.move(upper.where(lambda X: np.abs(X[:, 2]) > 0.59), pbng.Translate((0, -0.25, 0)), over=0.3)
+    inertia = how != "pressed slowly"
+    frames = list(
+        pbng.simulate(
+            scene, pbng.PBNG(), pbng.Budget(rtol=1e-3, iterations=300), frames=12, inertia=inertia, velocity=velocity
+        )
+    )
+    height = [(f.x[keel, 1] - f.x[ridge, 1]).mean() for f in frames]
+    assert min(height) > -0.015
+    assert frames[-1].x[ridge, 1].mean() < frames[0].x[ridge, 1].mean() - 0.05
+    assert frames[-1].result.inverted == 0
 
 
 @pytest.mark.parametrize("collider", ["plate", "bullet"])
