@@ -78,3 +78,11 @@ def test_the_same_bits_for_any_number_of_threads():
         assert last.contact.pairs > 0
         found.append((last.x.tobytes(), last.result.iterations, last.result.residual))
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("solver", [pbng.PBNG(), pbng.MultigridPBNG()])
+def test_rough_walls_let_a_solve_go_on_in_float64(solver):
+    """What rubs is stiff, and rounding shows in it; and the second round begins where float32 has ended."""
+    result = pbng.solve(squeezed(9, 0.3), solver, pbng.Budget(rtol=1e-6, iterations=1000))
+    assert result.status is pbng.Status.CONVERGED
+    assert result.residual <= 1e-6 * result.residuals[0]

@@ -242,15 +242,16 @@ def test_rest_ends_at_once_with_the_default_budget(dtype, status):
 
 
 def test_a_load_below_the_rounding_of_float32_is_not_called_converged():
-    """Where float32 cannot tell the state from equilibrium it says so; float64 solves it."""
+    """Where float32 cannot tell the state from equilibrium it says so; float64, and "auto" in it, solves it."""
     scene = pbng.Scene()
     body = scene.add(pbng.shapes.box(vertices=3), pbng.Corotated(E=1e5, nu=0.3))
     scene.pin(body.where(x=0.0))
     scene.force(body.where(x=1.0), (1e-7, 0, 0))
-    assert pbng.solve(scene).status is pbng.Status.PRECISION
-    exact = pbng.solve(scene, DOUBLE)
-    assert exact.status is pbng.Status.CONVERGED
-    assert exact.reduction <= 1e-3
+    for single in (pbng.PBNG(dtype="float32"), pbng.MultigridPBNG(dtype="float32")):
+        assert pbng.solve(scene, single).status is pbng.Status.PRECISION
+    for exact in (pbng.solve(scene), pbng.solve(scene, DOUBLE)):
+        assert exact.status is pbng.Status.CONVERGED
+        assert exact.reduction <= 1e-3
 
 
 def test_far_from_the_origin():

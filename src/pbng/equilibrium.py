@@ -251,7 +251,8 @@ def joined(results: list[Result], moved: list[float]) -> Result:
     if len(results) == 1:
         return last
     done = np.cumsum([0] + [r.iterations for r in results])
-    rate = min(moved[-1] / moved[-2], SLOWEST) if moved[-2] > 0 else 0.0
+    unknown = SLOWEST if last.iterations else 0.0
+    rate = min(moved[-1] / moved[-2], SLOWEST) if moved[-2] > 0 else unknown
     return replace(
         last,
         error=moved[-1] * rate / (1 - rate) + (last.error if last.iterations else results[-2].error),

@@ -188,7 +188,10 @@ class ContactEnergy:
         """A third of the trace of each node's Hessian [N/m] at x, of the first n nodes."""
         active = self._gaps(x)[1] < 0
         k = (np.where(active, self.k_n, 0.0) + 2 * self.k_tau) / 3
-        return np.asarray(self.spread.power(2) @ k)[:n]
+        stiffness = np.asarray(self.spread.power(2) @ k)
+        if self.rubs:
+            np.add.at(stiffness, self.vertex, 2 / 3 * self.friction / self._slid(x)[1])
+        return stiffness[:n]
 
     def active(self, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Which contacts resist at x, and which half-spaces are touched to within a tolerance [m], (m + k,) bool."""

@@ -57,9 +57,11 @@ def run(
     if budget.rtol is not None and not method.problem.weak:
         tolerance = max(tolerance, method.floor(np.float64))  # a fraction of rounding cannot be asked for
     status = _verdict(history, tolerance, floor, budget.error)
+    at_all = budget.cap > 0 and budget.seconds != 0
+    if status is Status.PRECISION and at_all and method.refine():
+        refined, status, floor = True, None, method.floor()
     iteration, correction = 0, 0.0
     seen = -1, x  # an iteration and the state after it
-    at_all = budget.cap > 0 and budget.seconds != 0
     if status is None and at_all and before is not None and (better := method.prepare(before, x)) is not None:
         method.start(contacts.put_outside(better) if contacts is not None else better, targets, contacts)
         if refined:
