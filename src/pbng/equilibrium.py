@@ -83,8 +83,9 @@ class Toucher:
             if not self.checked:
                 self.detector.check(x0, t0)
                 self.checked = True
-            self.detector.borne = self.method.borne() if self.inherited is None else self.inherited
-            self.inherited = None
+            if self.detector.rubs:
+                self.detector.borne = self.method.borne() if self.inherited is None else self.inherited
+                self.inherited = None
             self.contacts = self.detector.find(x0, x1, t0, t1, **options)
         self.seconds += time.perf_counter() - start
         return self.contacts

@@ -27,9 +27,10 @@ class Detector:
         self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
         self.free = spec.surface[~fixed[spec.surface]]
         self.reach = self.surfaces.radius if self.surfaces else spec.margin  # farther off, directions are of no use [m]
+        self.rubs = any(c.friction for c in spec.colliders)
         self.ties = Contacts()  # between surfaces, since the last step began
         self.since: tuple[np.ndarray, float] | None = None  # where the last step began, and when [s]
-        self.borne = np.zeros((len(X), 3))  # with what force [N] colliders bear each vertex
+        self.borne = np.zeros((len(X), 3))  # with what force [N] colliders bear each vertex, as far as it rubs
 
     def check(self, x: np.ndarray, t: float) -> None:
         """InputError if a body lies wholly inside another, or inside a collider at time t [s], at x (n_vert, 3)."""
