@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from pbng.errors import InputError
-from pbng.io.frames import read_run
+from pbng.io.frames import read_run, solved
 from pbng.io.meshes import MESHES, SURFACES, read_mesh, read_surface
 from pbng.mesh_quality import quality
-from pbng.view.residuals import solved
 
 Rows = Iterator[tuple[str, str]]
 

@@ -19,11 +19,10 @@ from pbng.drivers import Frame, simulate
 from pbng.equilibrium import ContactReport
 from pbng.errors import InputError
 from pbng.gallery.recipe import Recipe
-from pbng.io.frames import FrameWriter
+from pbng.io.frames import FrameWriter, solved
 from pbng.problem import Problem
 from pbng.solvers import base
 from pbng.solvers.base import Budget, Result, Solver, Status
-from pbng.view.residuals import solved
 
 SWINGING = 1.0  # how long [s] to look on after the last motion has ended, where there is inertia
 

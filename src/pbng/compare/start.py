@@ -10,8 +10,7 @@ from pbng.errors import InputError
 from pbng.packing import origin_of
 from pbng.problem import Problem
 from pbng.solvers.base import Method
-
-TOUCHED = 4.0  # roundings of float32 that a vertex may be off a half-space and touch it
+from pbng.solvers.pbng import SLACK
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +103,7 @@ class Judge:
             if self.touching:
                 near = x - self.origin
                 f += self.touching.forces(near)[0]
-                self.touching.balance(f, near, TOUCHED * 0.5 * float(np.finfo(np.float32).eps * np.abs(near).max()))
+                self.touching.balance(f, near, SLACK * 0.5 * float(np.finfo(np.float32).eps * np.abs(near).max()))
                 energy += self.touching.energy(near)
             return Seen(float(np.linalg.norm(f[self.free])), energy, distance(x, self.reference), inverted)
 

@@ -12,7 +12,7 @@ from pbng.mesh import triangle_areas
 from pbng.parallel import array, body, each, rows
 from pbng.topology import entries
 
-CREASE = 0.9  # cosine of the angle between normals at rest, below which one triangle does not count for the other's
+SHARP = 0.9  # cosine of the angle between normals below which an edge counts as sharp
 
 
 class SmoothNormals:
@@ -23,16 +23,19 @@ class SmoothNormals:
     Args:
         X: Rest positions [m], (n_vert, 3).
         triangles: Outward triangles, (m, 3) int32.
+
+    Attributes:
+        around: The triangles around each vertex, as :func:`pbng.contact.rings.neighbourhoods` gives them.
     """
 
     def __init__(self, X: np.ndarray, triangles: np.ndarray) -> None:
         self.triangles = np.ascontiguousarray(triangles, np.int32)
-        first, around = neighbourhoods(self.triangles, len(X), 1)
+        first, around = self.around = neighbourhoods(self.triangles, len(X), 1)
         owner, at = entries(first, self.triangles.ravel())
         other = around[at]
         normal = triangle_areas(X, self.triangles)
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-        near = (normal[owner // 3] * normal[other]).sum(1) > CREASE
+        near = (normal[owner // 3] * normal[other]).sum(1) > SHARP
         near |= owner // 3 == other  # a triangle of no area has no normal
         self.ids = other[near]
         self.start = np.concatenate([[0], np.cumsum(np.bincount(owner[near], minlength=self.triangles.size))])

@@ -14,7 +14,7 @@ import numpy as np
 
 from pbng.contact.bvh import BoxTree
 from pbng.contact.contacts import Contacts
-from pbng.contact.normals import SmoothNormals
+from pbng.contact.normals import SHARP, SmoothNormals
 from pbng.contact.queries import closest_edges, closest_triangles, containing_tets
 from pbng.contact.rings import neighbourhoods
 from pbng.contact.spec import CLOSE, NEAR, Surfaces
@@ -25,7 +25,6 @@ from pbng.topology import edge_sides, entries
 STIFF = 10.0  # default stiffness, in E h of the softer body
 PUSH = 5.0  # how many edges a second a stiff contact may push apart what overlaps [1/s]
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
-SHARP = 0.9  # cosine of the angle between the normals at an edge, below which it counts as sharp
 SLIPPED = 4.0  # how much closer a triangle must be by which a vertex does not face what it is inside of
 TOUCHING = 1e-9  # of the radius: closer points have no direction between them
 ROOM = 1e-6  # of the distance that is kept, by which surfaces at rest may be too close
@@ -68,7 +67,6 @@ class SurfaceDetector:
         self.solid[np.unique(s.tet_body)] = True
         self.edges, self.beside = self._sharp_edges(X)
         edge_body = self.body[self.edges[:, 0]]
-        self.around = neighbourhoods(s.triangles, len(X), 1)
         self.normals = SmoothNormals(X, s.triangles)
         self.triangles = BoxTree(X, s.triangles, s.body)
         self.edge_tree = BoxTree(X, self.edges, edge_body)
@@ -258,7 +256,7 @@ class SurfaceDetector:
 
     def _vertex_normals(self, x: np.ndarray, vertex: np.ndarray) -> np.ndarray:
         """Sum of the area vectors of the triangles around vertices, (k, 3)."""
-        start, triangle = self.around
+        start, triangle = self.normals.around
         of, at = entries(start, vertex)
         first = np.searchsorted(of, np.arange(len(vertex)))
         return np.add.reduceat(triangle_areas(x, self.surfaces.triangles[triangle[at]]), first)

@@ -289,6 +289,15 @@ class Run(Sequence[StoredFrame]):
         return f"Run({str(self.path)!r}: {len(self)} frames of {', '.join(body.name for body in self.bodies)})"
 
 
+def solved(frames: Sequence[Any], moving: bool) -> Sequence[Any]:
+    """Those of the frames of a run, or of what is known of each, that a solver made.
+
+    With inertia, ``moving``, the first is the start, whose residual says nothing of how well the run was solved; if
+    there is no other, it has to do.
+    """
+    return frames[1:] or frames if moving else frames
+
+
 def read_run(path: str | os.PathLike[str]) -> Run:
     """Open a run that a :class:`FrameWriter` wrote, finished or not; raises what :class:`Run` raises."""
     return Run(path)

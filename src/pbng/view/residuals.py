@@ -1,20 +1,8 @@
 """What the solver left of the residuals of a run."""
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 
-from pbng.io.frames import Run
-
-
-def solved(frames: Sequence[Any], moving: bool) -> Sequence[Any]:
-    """Those of the frames of a run, or of what is known of each, that a solver made.
-
-    With inertia, ``moving``, the first is the start, whose residual says nothing of how well the run was solved; if
-    there is no other, it has to do.
-    """
-    return frames[1:] or frames if moving else frames
+from pbng.io.frames import Run, solved
 
 
 def residual_curves(run: Run) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], str]:
