@@ -1,6 +1,7 @@
 """Contact in the sweep: energy, forces, Hessian, momentum, colours."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numba
 import numpy as np
@@ -11,6 +12,9 @@ import scipy.sparse
 import pbng
 from pbng.contact.contacts import ContactEnergy, Contacts
 from pbng.contact.detection import Detector
+from pbng.contact.nodes import HELD
+from pbng.elements.base import W
+from pbng.packing import NODAL
 from pbng.solvers.acceleration import NodeSOR
 from pbng.solvers.loop import run
 
@@ -237,6 +241,40 @@ def test_colors_are_valid_and_kept():
     method.start(contacts.put_outside(x), contacts=Contacts(**vars(contacts)))
     assert np.array_equal(before, nodes.color)
     assert nodes.repacked == repacked
+
+
+def test_layouts_that_grow_are_as_good_as_new(monkeypatch):
+    """Contacts come and go: each node in contact moves in one lane, all others in none, and sweeps come to rest."""
+    problem, x, contacts = in_contact(n=5)
+    method = pbng.PBNG(dtype="float64").set_up(problem)
+    monkeypatch.setattr("pbng.contact.nodes.ROOM", 2.0)  # a small scene has few blocks
+    rng, grown = np.random.default_rng(0), 0
+    among = rng.random(len(contacts.vertices)) < 0.6
+    for step in range(12):
+        among ^= rng.random(len(among)) < 0.03
+        some = {
+            name: getattr(contacts, name)[among]
+            for name in ("vertices", "weights", "normal", "offset", "k_n", "k_tau", "start", "kept")
+        }
+        found = replace(contacts, **some)
+        before = method.contact_nodes["float64"].laid if step else 0
+        method.start(found.put_outside(x), contacts=found)
+        method.step()
+        nodes = method.contact_nodes["float64"]
+        grown += before < nodes.laid and nodes.laid > len(nodes.node)
+        moving = nodes.owner[nodes.place >= 0]
+        assert np.array_equal(np.sort(moving), nodes.node)
+        assert np.array_equal(nodes.place[nodes.place >= 0], 4 * method.packed.slot[moving])
+        for first, last in pairwise(nodes.blocks.color_start):
+            lanes = slice(W * first, W * last)
+            assert len(np.unique(nodes.color[nodes.owner[lanes][nodes.place[lanes] >= 0]])) <= 1
+        held = nodes.others.nodal.reshape(-1, NODAL, W)[:, 3].ravel() == HELD
+        assert np.array_equal(np.flatnonzero(held), np.sort(method.packed.slot[nodes.node]))
+    assert grown >= 3
+    first = method.certify().residual
+    for _ in range(300):
+        method.step()
+    assert method.certify().residual < 1e-9 * first
 
 
 def test_a_node_that_meets_many_colors_gets_a_free_one():

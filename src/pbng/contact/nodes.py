@@ -1,4 +1,4 @@
-"""Nodes in contact: a layout of their own, made anew where contacts change, swept after the others (section 10.1).
+"""Nodes in contact: a layout of their own, that grows where contacts change, swept after the others (section 10.1).
 
 A node in contact sees, besides its elements, one-sided terms: the springs of contacts and the half-spaces of colliders.
 With u = A⁻¹f its step without them, its local problem is convex,
@@ -9,8 +9,8 @@ and its dual has one multiplier a contact, the force in it over ω. Each is set 
 the others, exact at once for a single contact, starting from the last sweep's. As for a node without contact, the
 energy falls for any 0 < ω < 2: ωu - d is ω times a subgradient of the contacts' energy, and that is convex.
 
-For the time of its contact a node is held in the static layout by a Hessian as good as infinite, and laid out in blocks
-of its own, with colours of their own: contacts couple nodes that elements do not.
+For the time of its contact a node is held in the static layout by a Hessian as good as infinite, and has a lane in
+blocks of its own, with a colour of its own: contacts couple nodes that elements do not.
 """
 
 import math
@@ -26,15 +26,15 @@ from pbng.coloring import recolor
 from pbng.contact.contacts import Contacts
 from pbng.dispatch import call, specialised
 from pbng.elements.base import AHEAD, W
-from pbng.jit import compile_seconds, inline
+from pbng.jit import compile_seconds, inline, serial
 from pbng.linalg import dot, scale, solve_spd, sub
-from pbng.packing import NODAL, Packed
+from pbng.packing import NODAL, Packed, Rows, aligned
 from pbng.parallel import array, body, rows, run, scratch
 from pbng.problem import Problem
 from pbng.sweep import aligned_part
-from pbng.topology import entries
 
 HELD = 1e30  # diagonal of the Hessian of a node that is swept elsewhere: it does not move
+ROOM = 1.25  # of what is laid out at once: so much comes later
 ROUNDS = 8  # of multipliers of a node with several contacts
 # Numbers of an incidence: own weight, sum of all, 3 others, normal, offset, compliance, tangential stiffness, friction,
 # and what slips from where: C₀, or the anchor.
@@ -45,6 +45,9 @@ _1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(1, 
 class ContactNodes:
     """Layout and sweep of the nodes in contact of a packed problem.
 
+    Nodes that come into contact are laid out in blocks behind those that are there, and the lanes of nodes that leave,
+    or get another colour, are passed over. When there is no room left all are laid out anew.
+
     Args:
         problem: What is solved.
         packed: Its layout.
@@ -54,106 +57,203 @@ class ContactNodes:
         assert problem.contact is not None
         self.problem, self.packed = problem, packed
         self.neighbours = _neighbours(problem, problem.contact.surface)
-        self.color = problem.color.copy()  # of the last step, for nodes that were in contact then
+        self.color = problem.color.copy()  # of nodes that have a lane perhaps another
         self.contacts: Contacts | None = None  # of this step
         self.node = np.empty(0, np.int64)  # in contact, in order of the problem
         self.recolored = self.repacked = 0  # nodes so far, and how long it took [s]
         self.seconds = 0.0
         self.others = replace(packed, nodal=packed.nodal.copy())  # what is swept of the rest
-        self.color_start = np.zeros(1, np.int64)
+        self.held = np.empty(0, np.int64)  # where in it nodes are that are not
+        self.rank = np.empty(problem.n_vert, np.int64)
+        self.rank[problem.order] = np.arange(problem.n_vert)
+        self.blocks = Blocks(packed.dtype)
+        self.owner = np.empty(0, np.int64)  # node of each lane; of padding lanes, one of the block
+        self.lane = np.full(problem.n_vert, -1)  # of each node that has one
+        self.laid = 0  # nodes with lanes
 
     def update(self, contacts: Contacts) -> None:
         """Take the contacts of a new step."""
         self.contacts = contacts
         start = time.perf_counter() - compile_seconds()
-        problem = self.problem
-        found = np.zeros(problem.n_vert, bool)
+        found = np.zeros(self.problem.n_vert, bool)
         found[contacts.vertices] = True
         found[contacts.vertex] = True
-        node = np.flatnonzero(found & ~problem.fixed)
-        was = np.zeros(problem.n_vert, bool)
-        was[self.node] = True
-        new = node[~was[node]]
-        self.color[new] = problem.color[new]
+        found &= ~self.problem.fixed
+        node = np.flatnonzero(found)
         before = self.color[node]
-        recolor(node, self.color, *self.neighbours, contacts.vertices, found & ~problem.fixed)
-        recolored = int((self.color[node] != before).sum())
-        self.recolored += recolored
-        if recolored or not np.array_equal(node, self.node):
+        recolor(node, self.color, *self.neighbours, contacts.vertices, found)
+        recolored = node[self.color[node] != before]
+        self.lane[recolored] = -1
+        if recolored.size or not np.array_equal(node, self.node):
             self.node = node
             self._lay_out()
+            self._hold()
+        self.recolored += len(recolored)
         self._incidences(contacts)
         self.seconds += time.perf_counter() - compile_seconds() - start
 
     def _lay_out(self) -> None:
-        """Blocks of the nodes in contact, and their places in the static layout held."""
-        packed, layout = self.packed, self.packed.layout
-        inside = np.zeros(self.problem.n_vert, bool)
-        inside[self.node] = True
-        order = self.problem.order[inside[self.problem.order]]
-        self.color_start, node = layout.numbering(order, self.color)
-        self.rows = layout.rows(node, packed.places, len(node) // W)
-        self.real = node >= 0
-        self.owner = np.where(self.real, node, np.repeat(node[::W], W))
-        self.place = np.where(self.real, 4 * packed.slot[self.owner], -1 - 4 * packed.slot[self.owner])
-        self.repacked += len(self.node)
-        self.others.nodal[:] = packed.nodal
-        slot = packed.slot[self.node]
-        for to, source, _ in packed.carried:  # nor do compounds that would carry them along
+        """Give nodes that have none a lane, or where there is no room for them all that are in contact."""
+        new = self.node[self.lane[self.node] < 0]
+        needed = -(-np.bincount(self.color[new]) // W).sum()
+        fits = needed <= self.blocks.room and 2 * len(self.node) >= self.laid
+        if len(new) and fits:
+            fits = self._append(new)
+        if not fits:
+            outside = np.ones(self.problem.n_vert, bool)
+            outside[self.node] = False
+            self.color[outside] = self.problem.color[outside]
+            self.blocks, self.owner, self.laid = Blocks(self.packed.dtype), np.empty(0, np.int64), 0
+            self.lane[:] = -1
+            self._append(self.node)
+
+    def _append(self, node: np.ndarray) -> bool:
+        """Lay out nodes in blocks behind those that there are. Whether there is room."""
+        layout, order = self.packed.layout, node[np.argsort(self.rank[node])]
+        color_start, owner = layout.numbering(order, self.color)
+        if not self.blocks.append(color_start, layout.rows(owner, self.packed.places, len(owner) // W)):
+            return False
+        real = owner >= 0
+        self.lane[owner[real]] = len(self.owner) + np.flatnonzero(real)
+        self.owner = np.concatenate([self.owner, np.where(real, owner, np.repeat(owner[::W], W))])
+        self.laid += len(node)
+        self.repacked += len(node)
+        return True
+
+    def _hold(self) -> None:
+        """Hold the nodes in contact in the static layout, and no others."""
+        packed, slot = self.packed, self.packed.slot[self.node]
+        for to, source, _ in packed.carried:  # nor do compounds move that would carry them along
             slot = np.concatenate([slot, source[np.isin(to, slot)]])
-        held = self.others.nodal.reshape(-1, NODAL, W)
+        at = NODAL * W * (slot // W) + slot % W
         for k in (3, 6, 8):
-            held[slot // W, k, slot % W] = HELD
+            self.others.nodal[self.held + W * k] = packed.nodal[self.held + W * k]
+            self.others.nodal[at + W * k] = HELD
+        self.held = at
 
     def _incidences(self, contacts: Contacts) -> None:
-        """What each lane sees of the contacts."""
+        """What each lane sees of the contacts, and which lanes move."""
         c, packed, dtype = contacts, self.packed, self.packed.dtype
-        m = len(c.vertices)
-        corner = c.vertices.ravel()
-        contact, which = np.repeat(np.arange(m), 4), np.tile(np.arange(4), m)
-        mine = np.flatnonzero(~self.problem.fixed[corner] & (c.weights.ravel() != 0))
-        contact, which = contact[mine], which[mine]
-        walls = np.flatnonzero(~self.problem.fixed[c.vertex])
-        own = np.concatenate([corner[mine], c.vertex[walls]])
-        rest = (which[:, None] + np.arange(1, 4)) % 4
-        row = np.zeros((len(own), ROW))
-        n = len(mine)
-        row[:n, 0] = c.weights[contact, which]
-        row[:n, 2:5] = c.weights[contact[:, None], rest]
-        row[:n, 5:8] = c.normal[contact]
-        row[:n, 8] = c.offset[contact]
-        row[:n, 9] = 1 / c.k_n[contact]
-        row[:n, 10] = c.k_tau[contact]
-        row[:n, 12:] = c.start[contact]
-        row[n:, 0] = row[n:, 1] = 1
-        row[n:, 5:8] = c.plane[walls]
-        row[n:, 8] = c.level[walls] - c.plane[walls] @ packed.origin  # of contacts, weights sum to zero
-        row[n:, 11] = c.friction[walls]
-        row[n:, 12:] = c.anchor[walls] - packed.origin
-        other = np.zeros((len(own), 3), np.uint32)
-        other[:n] = 4 * packed.slot[c.vertices[contact[:, None], rest]]
-        other[n:] = (4 * packed.slot[c.vertex[walls]])[:, None]
-        order = np.argsort(own, kind="stable")
-        count = np.bincount(own, minlength=self.problem.n_vert)
-        first = np.concatenate([[0], np.cumsum(count)])
-        lanes, per_lane = self.owner[self.real], np.zeros(len(self.real), np.int64)
-        per_lane[self.real] = count[lanes]
-        self.first = np.concatenate([[0], np.cumsum(per_lane)])
-        taken = order[entries(first, lanes)[1]]
-        self.other, self.row = np.ascontiguousarray(other[taken]), np.ascontiguousarray(row[taken], dtype)
-        self.force, self.creep = np.zeros(len(taken), dtype), c.creep
+        lane = np.full(self.problem.n_vert, -1)
+        lane[self.node] = self.lane[self.node]
+        place = 4 * packed.slot[self.owner]
+        self.place = -1 - place
+        self.place[lane[self.node]] = place[lane[self.node]]
+        most = 4 * len(c.vertices) + len(c.vertex)
+        self.first = np.zeros(len(self.owner) + 1, np.int64)
+        other, row = np.zeros((most, 3), np.uint32), np.zeros((most, ROW), dtype)
+        _list_incidences(
+            lane, packed.slot, packed.origin, c.vertices, c.weights, c.normal, c.offset, c.k_n, c.k_tau, c.start,
+            c.vertex, c.plane, c.level, c.friction, c.anchor, self.first, other, row,
+        )  # fmt: skip
+        self.other, self.row = other[: self.first[-1]], row[: self.first[-1]]
+        self.force, self.creep = np.zeros(self.first[-1], dtype), c.creep
 
     def sweep(self, x: np.ndarray, omega: float, symmetric: bool = False) -> None:
         """Update every node in contact once, in place, or back in reverse order of the colours besides."""
-        p, r = self.packed, self.rows
+        p, b = self.packed, self.blocks
         arrays = (
-            x, r.seg_start, r.seg, r.idx, r.coef, r.nodal, p.parameters, np.array([omega, self.creep], p.dtype),
+            x, b.seg_start, b.seg, b.idx, b.coef, b.nodal, p.parameters, np.array([omega, self.creep], p.dtype),
             self.place, self.first, self.other, self.row, self.force,
         )  # fmt: skip
         blocks = specialised(make_contact_sweep, p.functions, p.dtype)
-        forward = np.arange(len(self.color_start) - 1)
+        forward = np.arange(len(b.color_start) - 1)
         colors = np.concatenate([forward, forward[::-1]]) if symmetric else forward
-        run(blocks, arrays, colors, self.color_start, 4)
+        run(blocks, arrays, colors, b.color_start, 4)
+
+
+class Blocks:
+    """Rows of blocks, as of :class:`pbng.packing.Packed`; what is laid out first makes room for more behind it.
+
+    Attributes:
+        color_start: First block of each set that is swept at once, the first past the last included.
+        room: How many blocks more there is room for.
+    """
+
+    def __init__(self, dtype: Any) -> None:
+        self.color_start, self.seg_start = np.zeros(1, np.int64), np.zeros(1, np.int64)
+        self.seg = np.empty((0, 5), np.int64)
+        self.idx, self.coef, self.nodal = np.empty(0, np.uint32), np.empty(0, dtype), np.empty(0, dtype)
+        self.used: np.ndarray = np.zeros(3, np.int64)  # of these three
+
+    @property
+    def room(self) -> int:
+        return (len(self.nodal) - int(self.used[2])) // (NODAL * W)
+
+    def append(self, color_start: np.ndarray, rows: Rows) -> bool:
+        """Add blocks, as sets of their own. Whether there was room for them."""
+        new = rows.idx, rows.coef, rows.nodal
+        if not self.used.any():
+            self.idx, self.coef, self.nodal = (aligned(int(ROOM * len(a)), a.dtype) for a in new)
+        end = self.used + [len(a) for a in new]
+        if (end > [len(self.idx), len(self.coef), len(self.nodal)]).any():
+            return False
+        for a, first, last, more in zip((self.idx, self.coef, self.nodal), self.used, end, new):
+            a[first:last] = more
+        self.seg_start = np.concatenate([self.seg_start, len(self.seg) + rows.seg_start[1:]])
+        self.seg = np.concatenate([self.seg, rows.seg + np.array([0, 0, 0, *self.used[:2]])])
+        self.color_start = np.concatenate([self.color_start, self.color_start[-1] + color_start[1:]])
+        self.used = end
+        return True
+
+
+@serial
+def _list_incidences(
+    lane, slot, origin, vertices, weights, normal, offset, k_n, k_tau, start, vertex, plane, level, friction, anchor,
+    first, other, row,
+):  # fmt: skip
+    """List what each lane sees, contacts in their order and then half-spaces: ``first``, ``other`` and ``row``.
+
+    Args:
+        lane: The lane of each vertex, (n_vert,), -1 for those that do not move.
+        slot, origin: As of :class:`pbng.packing.Packed`.
+        vertices, ..., anchor: As of :class:`pbng.contact.contacts.Contacts`.
+        first: Of each lane the first incidence, (n_lane + 1,), zero when given.
+        other, row: Of each incidence the places of the other corners, (n, 3), and its numbers (n, ROW).
+    """
+    m, k = len(vertices), len(vertex)
+    for c in range(m):
+        for a in range(4):
+            if weights[c, a] != 0 and lane[vertices[c, a]] >= 0:
+                first[lane[vertices[c, a]] + 1] += 1
+    for c in range(k):
+        if lane[vertex[c]] >= 0:
+            first[lane[vertex[c]] + 1] += 1
+    for l in range(len(first) - 1):
+        first[l + 1] += first[l]
+    position = first[:-1].copy()
+    for c in range(m):
+        for a in range(4):
+            l = lane[vertices[c, a]]
+            if weights[c, a] == 0 or l < 0:
+                continue
+            i = position[l]
+            position[l] += 1
+            row[i, 0] = weights[c, a]
+            for j in range(3):
+                b = (a + 1 + j) % 4
+                other[i, j] = 4 * slot[vertices[c, b]]
+                row[i, 2 + j] = weights[c, b]
+                row[i, 5 + j] = normal[c, j]
+                row[i, 12 + j] = start[c, j]
+            row[i, 8] = offset[c]
+            row[i, 9] = 1 / k_n[c]
+            row[i, 10] = k_tau[c]
+    for c in range(k):
+        l = lane[vertex[c]]
+        if l < 0:
+            continue
+        i = position[l]
+        position[l] += 1
+        row[i, 0] = row[i, 1] = 1.0
+        at = level[c]  # of contacts, weights sum to zero, and it does not matter what positions are relative to
+        for j in range(3):
+            other[i, j] = 4 * slot[vertex[c]]
+            row[i, 5 + j] = plane[c, j]
+            row[i, 12 + j] = anchor[c, j] - origin[j]
+            at -= plane[c, j] * origin[j]
+        row[i, 8] = at
+        row[i, 11] = friction[c]
 
 
 def _neighbours(problem: Problem, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
