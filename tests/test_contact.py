@@ -151,12 +151,17 @@ def test_closing_forces_are_at_rest_where_gaps_are_closed():
     assert (energy.closing(x, closed, bearing) == 0).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_sweeps_come_to_rest_where_forces_do(seed):
+@pytest.mark.parametrize(
+    ("solver", "most"),
+    [(pbng.PBNG(NodeSOR(1.5), dtype="float64"), 1000), (pbng.PBNG(dtype="float64"), 150),
+     (pbng.MultigridPBNG(dtype="float64"), 40)],
+)  # fmt: skip
+@pytest.mark.parametrize("seed", range(4))
+def test_solves_come_to_rest_where_forces_do(seed, solver, most):
     """Contacts, what sticks and rubs, and corners of several half-spaces: kernel and certificate mean the same."""
     problem, x, contacts = in_contact(seed, k_tau=30.0)
-    method = pbng.PBNG(NodeSOR(1.5), dtype="float64").set_up(problem)
-    result = run(method, contacts.put_outside(x), pbng.Budget(rtol=1e-8, iterations=1000), contacts=contacts)
+    method = solver.set_up(problem)
+    result = run(method, contacts.put_outside(x), pbng.Budget(rtol=1e-8, iterations=most), contacts=contacts)
     assert result.status is pbng.Status.CONVERGED
     height = (contacts.plane * result.x[contacts.vertex]).sum(1) - contacts.level
     assert height.min() > -1e-9

@@ -35,7 +35,7 @@ from pbng.sweep import aligned_part
 
 HELD = 1e30  # diagonal of the Hessian of a node that is swept elsewhere: it does not move
 ROOM = 1.25  # of what is laid out at once: so much comes later
-ROUNDS = 8  # of multipliers of a node with several contacts
+ROUNDS, SETTLED = 64, 16  # of multipliers of a node: at most, and what change [units in the last place] ends them
 # Numbers of an incidence: own weight, sum of all, 3 others, normal, offset, compliance, tangential stiffness, friction,
 # and what slips from where: C₀, or the anchor.
 ROW = 15
@@ -153,7 +153,7 @@ class ContactNodes:
         """Update every node in contact once, in place, or back in reverse order of the colours besides."""
         p, b = self.packed, self.blocks
         arrays = (
-            x, b.seg_start, b.seg, b.idx, b.coef, b.nodal, p.parameters, np.array([omega, self.creep], p.dtype),
+            x, b.seg_start, b.seg, b.idx, b.coef, b.nodal, p.parameters, np.array([omega, self.creep, SETTLED * np.finfo(p.dtype).eps], p.dtype),
             self.place, self.first, self.other, self.row, self.force,
         )  # fmt: skip
         blocks = specialised(make_contact_sweep, p.functions, p.dtype)
@@ -284,7 +284,8 @@ def make_contact_sweep(key: str, dtype: np.dtype) -> Any:
     def blocks(arguments, low, high):
         x, seg_start, seg = array(arguments, 0, real), array(arguments, 1, np.int64), rows(arguments, 2, 5, np.int64)
         idx, coef, nodal = array(arguments, 3, np.uint32), array(arguments, 4, real), array(arguments, 5, real)
-        par, omega, creep = array(arguments, 6, real), array(arguments, 7, real)[0], array(arguments, 7, real)[1]
+        par, numbers = array(arguments, 6, real), array(arguments, 7, real)
+        omega, creep, settled = numbers[0], numbers[1], numbers[2]
         place, first = array(arguments, 8, np.int64), array(arguments, 9, np.int64)
         other, row = rows(arguments, 10, 3, np.uint32), rows(arguments, 11, ROW, real)
         force = array(arguments, 12, real)
@@ -307,13 +308,13 @@ def make_contact_sweep(key: str, dtype: np.dtype) -> Any:
                 at = place[W * b + l_]
                 if at >= 0:
                     low_c, high_c = first[W * b + l_], first[W * b + l_ + 1]
-                    _step(uint64(at), x, acc, uint64(l_), omega, creep, low_c, high_c, other, row, force)
+                    _step(uint64(at), x, acc, uint64(l_), omega, creep, settled, low_c, high_c, other, row, force)
 
     return blocks
 
 
 @inline
-def _step(at, x, acc, l, omega, creep, low, high, other, row, force):
+def _step(at, x, acc, l, omega, creep, settled, low, high, other, row, force):
     """Solve the local problem of the node in lane l, whose position is at x[at], and move it."""
     real = type(omega)
     a0, a1, a2 = acc[_3 + l], acc[_4 + l], acc[_5 + l]
@@ -349,6 +350,7 @@ def _step(at, x, acc, l, omega, creep, low, high, other, row, force):
             d1 += p * y1
             d2 += p * y2
     for _ in range(ROUNDS if high - low > 1 else 1):
+        largest, most = real(0), real(0)
         for c in range(low, high):
             w = row[c, 0]
             m = scale(w, (row[c, 5], row[c, 6], row[c, 7]))
@@ -361,9 +363,12 @@ def _step(at, x, acc, l, omega, creep, low, high, other, row, force):
             p = max(force[c] - left / q, real(0))
             change = p - force[c]
             force[c] = p
+            largest, most = max(largest, p), max(most, abs(change))
             d0 += change * y0
             d1 += change * y1
             d2 += change * y2
+        if most <= settled * largest:
+            break
     x[at] = acc[_9 + l] + d0
     x[at + uint64(1)] = acc[_10 + l] + d1
     x[at + uint64(2)] = acc[_11 + l] + d2
