@@ -37,7 +37,7 @@ def test_what_nothing_holds_has_no_equilibrium():
     beam = scene.add(pbng.shapes.box((1.0, 0.25, 0.25), (5, 2, 2)), pbng.Corotated(E=1e4, nu=0.3))
     scene.pin(beam.where(x=0.0), until=0.1)
     problem = scene.compile()
-    with pytest.raises(pbng.InputError, match=r"at t = 0\.2 s nothing holds scene 'loose' any longer"):
+    with pytest.raises(pbng.InputError, match=r"after t = 0\.1 s nothing holds scene 'loose': .* give a time at="):
         contest(problem, {"newton": NEWTON}, iterations=1, at=0.2)
     assert contest(problem, {"newton": NEWTON}, iterations=1, at=0.05).problem.fixed.any()
 

@@ -101,6 +101,32 @@ def test_meshes_are_frozen_copies():
         mesh.X = X
 
 
+@pytest.mark.parametrize("kind", ["tets", "surface"])
+def test_moved_meshes(kind):
+    """Cells, groups and skin stay; measures and orientation are those of the new positions."""
+    named = {"groups": {"a": [0, 2]}, "cell_groups": {"b": [1]}}
+    if kind == "tets":
+        skin = pbng.Embedding(np.array([[0, 1, 2]]), np.array([[0, 1, 2, 3]] * 3), np.full((3, 4), 0.25))
+        mesh = pbng.TetMesh(CORNERS, TWO, skin=skin, **named)
+    else:
+        mesh = pbng.TriMesh(CORNERS, [[0, 1, 2], [1, 2, 3], [2, 3, 4]], **named)
+    before = mesh.volume.copy()
+    moved = mesh.moved(2 * mesh.X[:, [1, 2, 0]] + 1)  # turned, twice as large
+    np.testing.assert_array_equal(moved.X[1], [1, 1, 3])
+    np.testing.assert_array_equal(moved.cells, mesh.cells)
+    np.testing.assert_allclose(moved.volume, (8 if kind == "tets" else 4) * before, rtol=1e-14)
+    np.testing.assert_array_equal(moved.groups["a"], [0, 2])
+    np.testing.assert_array_equal(moved.cell_groups["b"], [1])
+    assert type(moved) is type(mesh)
+    np.testing.assert_array_equal(mesh.X, CORNERS)
+    np.testing.assert_array_equal(mesh.volume, before)
+    if kind == "tets":
+        assert moved.skin is mesh.skin
+        np.testing.assert_array_equal(mesh.moved(-mesh.X).flipped, [0, 1])
+    with pytest.raises(pbng.InputError, match="names a vertex outside"):
+        mesh.moved(mesh.X[:-1])
+
+
 def test_groups():
     """Masks and indices become sorted indices; what lies outside is named."""
     mesh = pbng.TetMesh(CORNERS, TWO, groups={"a": [4, 1, 1]}, cell_groups={"b": np.array([False, True])})

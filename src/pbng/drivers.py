@@ -84,9 +84,9 @@ def solve(
     """
     problem = scene.compile() if isinstance(scene, Scene) else scene
     t = problem.end if at is None else at
-    _check_held("solve", problem, t, "give a time at= before that")
+    check_held("solve", problem, t)
     problem = problem.at(t)
-    x, budget = _start(problem, start), budget or Budget()
+    x, budget = checked_start(problem, start), budget or Budget()
     method = (solver or default_solver(budget)).set_up(problem)
     toucher = Toucher(problem, method) if problem.contact else None
     return _timed(method, equilibrium(method, toucher, x, 0.0, t, budget, monitor))
@@ -130,13 +130,13 @@ def simulate(
     if not inertia and not (dt is None and substeps is None and velocity is None):
         raise InputError("simulate: dt, substeps and velocity are for inertia=True")
     problem = scene.compile(free=inertia) if isinstance(scene, Scene) else scene
-    x, budget = _start(problem, start), budget or Budget()
+    x, budget = checked_start(problem, start), budget or Budget()
     solver = solver or default_solver(budget)
     if inertia:
         steps = steps_of(fps, dt, substeps)
         moving = BackwardEuler(problem, solver, 1 / (fps * steps), x, velocities(problem, velocity))
         return _moving_frames(moving, steps, budget, frames, monitor)
-    _check_held("simulate", problem, (frames - 1) / fps, "take fewer frames, or inertia=True")
+    check_held("simulate", problem, (frames - 1) / fps, "take fewer frames, or inertia=True")
     return _frames(Equilibria(problem, solver, x), budget, frames, fps, monitor)
 
 
@@ -173,8 +173,8 @@ def _moving_frames(
             return  # the state is lost
 
 
-def _check_held(what: str, problem: Problem, t: float, way_out: str) -> None:
-    """InputError if until time t [s] all that holds the problem lets go."""
+def check_held(what: str, problem: Problem, t: float, way_out: str = "give a time at= before that") -> None:
+    """InputError, which begins with ``what``, if until time t [s] all that holds the problem lets go."""
     let_go = [since for since, phase in problem.phases() if since <= t and not phase.held]
     if problem.held and let_go:  # who compiled a problem with free=True that nothing ever held has asked for it
         raise InputError(
@@ -187,8 +187,9 @@ def _timed(method: Method, result: Result) -> Result:
     return replace(result, setup_seconds=method.setup_seconds)
 
 
-def _start(problem: Problem, start: np.ndarray | None) -> np.ndarray:
-    x = problem.X if start is None else np.asarray(start, float)
+def checked_start(problem: Problem, start: np.ndarray | None) -> np.ndarray:
+    """Where to start from, (n_vert, 3) [m]: a copy of ``start``, or the rest state; InputError if it cannot be used."""
+    x = problem.X if start is None else np.array(start, float)
     if x.shape != problem.X.shape:
         raise InputError(f"start must have shape {problem.X.shape}, not {x.shape}")
     if not np.isfinite(x).all():

@@ -2,9 +2,9 @@
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -111,6 +111,14 @@ class Mesh:
     def component(self) -> np.ndarray:
         """Label (n_vert,) of the connected part of each vertex."""
         return components(self.cells, self.n_vert)
+
+    def moved(self, X: np.ndarray) -> Self:
+        """The mesh with other rest positions X (n_vert, 3) [m], as when it is turned or scaled; a skin goes along.
+
+        Raises:
+            InputError: No mesh can be made of these.
+        """
+        return replace(self, X=X)  # made anew, so that what depends on X is checked and measured again
 
     def drawn(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (n, 3) [m] and triangles (m, 3) that stand for the mesh at x (n_vert, 3) in pictures and exports."""

@@ -79,7 +79,7 @@ class Scene:
         if not isinstance(mesh, Mesh):
             raise InputError(f"body {name!r}: expected a TetMesh or TriMesh, not {type(mesh).__name__}")
         if at is not None:
-            mesh = _translated(mesh, np.array(checked_vector(f"body {name!r}: at", at)))
+            mesh = mesh.moved(mesh.X + checked_vector(f"body {name!r}: at", at))
         start = sum(b.mesh.n_vert for b in self.bodies)
         wait = checked_number(f"body {name!r}: wait", wait, positive=False)
         body = Body(name, mesh, _materials(name, mesh, material), start, bending)
@@ -415,8 +415,3 @@ def _materials(name: str, mesh: Mesh, material: Any) -> tuple[tuple[Material, np
             f" ({len(wrong)} such cells)"
         )
     return tuple(parts)
-
-
-def _translated(mesh: Mesh, by: np.ndarray) -> Mesh:
-    extra = {"skin": mesh.skin} if isinstance(mesh, TetMesh) else {}
-    return type(mesh)(mesh.X + by, mesh.cells, groups=mesh.groups, cell_groups=mesh.cell_groups, **extra)

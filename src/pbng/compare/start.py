@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pbng.contact.contacts import ContactEnergy, Contacts
+from pbng.drivers import check_held, checked_start
 from pbng.errors import InputError
 from pbng.packing import origin_of
 from pbng.problem import Problem
@@ -45,19 +46,11 @@ class Start:
             raise InputError(
                 "a step of backward Euler has no equilibrium to compare methods on; give the problem itself"
             )
-        before = problem.X if start is None else np.array(start, float)
-        if before.shape != problem.X.shape:
-            raise InputError(f"start must have shape {problem.X.shape}, not {before.shape}")
-        if not np.isfinite(before).all():
-            raise InputError("start is not finite")
+        before = checked_start(problem, start)
         time = problem.end if at is None else float(at)
         if not np.isfinite(time):
             raise InputError(f"at must be finite, not {at}")
-        if problem.held and not problem.at(time).held:
-            raise InputError(
-                f"at t = {time:g} s nothing holds scene {problem.name!r} any longer: the equilibrium is not unique;"
-                " give a time at= before that"
-            )
+        check_held("compare", problem, time)
         problem = problem.at(time)
         return cls(before, problem.constrain(before, time), problem.targets(time), time)
 

@@ -60,8 +60,8 @@ class ContactNodes:
         self.color = problem.color.copy()  # of nodes that have a lane perhaps another
         self.contacts: Contacts | None = None  # of this step
         self.node = np.empty(0, np.int64)  # in contact, in order of the problem
-        self.recolored = self.repacked = 0  # nodes so far, and how long it took [s]
-        self.seconds = 0.0
+        self.recolored = self.repacked = 0  # nodes so far
+        self.seconds = 0.0  # that all this took
         self.others = replace(packed, nodal=packed.nodal.copy())  # what is swept of the rest
         self.held = np.empty(0, np.int64)  # where in it nodes are that are not
         self.rank = np.empty(problem.n_vert, np.int64)
@@ -84,7 +84,7 @@ class ContactNodes:
         recolor(node, self.color, *self.neighbours, contacts.vertices, found)
         recolored = node[self.color[node] != before]
         self.lane[recolored] = -1
-        if recolored.size or not np.array_equal(node, self.node):
+        if len(recolored) or not np.array_equal(node, self.node):
             self.node = node
             self._lay_out()
             self._hold()
@@ -152,8 +152,9 @@ class ContactNodes:
     def sweep(self, x: np.ndarray, omega: float, symmetric: bool = False) -> None:
         """Update every node in contact once, in place, or back in reverse order of the colours besides."""
         p, b = self.packed, self.blocks
+        numbers = np.array([omega, self.creep, SETTLED * np.finfo(p.dtype).eps], p.dtype)
         arrays = (
-            x, b.seg_start, b.seg, b.idx, b.coef, b.nodal, p.parameters, np.array([omega, self.creep, SETTLED * np.finfo(p.dtype).eps], p.dtype),
+            x, b.seg_start, b.seg, b.idx, b.coef, b.nodal, p.parameters, numbers,
             self.place, self.first, self.other, self.row, self.force,
         )  # fmt: skip
         blocks = specialised(make_contact_sweep, p.functions, p.dtype)

@@ -128,17 +128,13 @@ def _turned(mesh: TetMesh, rng: np.random.Generator) -> TetMesh:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return _moved(mesh, mesh.X @ R.T)
+    return mesh.moved(mesh.X @ R.T)
 
 
 def _of_length(mesh: TetMesh, length: float) -> TetMesh:
     """The mesh scaled so that its longest side has a length [m], about the middle of its bounding box."""
     low, high = mesh.X.min(0), mesh.X.max(0)
-    return _moved(mesh, (mesh.X - (low + high) / 2) * (length / (high - low).max()))
-
-
-def _moved(mesh: TetMesh, X: np.ndarray) -> TetMesh:
-    return TetMesh(X, mesh.cells, groups=mesh.groups, cell_groups=mesh.cell_groups, skin=mesh.skin)
+    return mesh.moved((mesh.X - (low + high) / 2) * (length / (high - low).max()))
 
 
 def _radius(mesh: TetMesh) -> float:

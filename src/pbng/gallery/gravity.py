@@ -68,8 +68,7 @@ def laid_along_x(mesh: TetMesh) -> TetMesh:
         1: np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
         2: np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
     }[int(np.ptp(mesh.X, axis=0).argmax())]
-    # The skin hangs on the vertices, so it turns along.
-    return TetMesh(mesh.X @ turn.T, mesh.cells, groups=mesh.groups, cell_groups=mesh.cell_groups, skin=mesh.skin)
+    return mesh.moved(mesh.X @ turn.T)
 
 
 def softness(mesh: TetMesh, end: int) -> float:

@@ -27,7 +27,7 @@ def rod(n: int) -> TetMesh:
     """A cylinder, 0.66 m long and 0.2 m across."""
     along, across, _ = _counts((0.66, 0.2, 0.2), n)
     mesh = cylinder(0.1, 0.66, (along, across))
-    return TetMesh(mesh.X - (0.33, 0.0, 0.0), mesh.cells)
+    return mesh.moved(mesh.X - (0.33, 0.0, 0.0))
 
 
 def ring(n: int) -> TetMesh:
