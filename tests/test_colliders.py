@@ -1,5 +1,7 @@
 """Colliders: distances against other formulas and brute force, half-spaces on the right side, bad input named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -307,6 +309,39 @@ def test_same_input_same_bits(name):
     same = one.vertex % 2 == 0
     assert (few.vertex * 2).tolist() == one.vertex[same].tolist()
     assert np.allclose(few.point, one.point[same], atol=1e-14)
+
+
+@pytest.mark.parametrize("motion", [None, MOTION, Rotate("x", 2.0)], ids=["rest", "screw", "spin"])
+@pytest.mark.parametrize("name", ["plane", "sphere", "capsule", "box"])
+def test_whoever_else_is_asked_about(name, motion):
+    """Far ones are left out in a hurry, by bounds that depend on all."""
+    collider = replace(SHAPES[name], motion=motion, over=1.0)
+    before = np.concatenate([points(300, 16), 4 * points(300, 17), 40 * points(300, 18)])
+    after = before + 0.3 * points(900, 19)
+    margin = 0.1 * np.random.default_rng(20).random(900)
+    every = collider.touch(before, after, 0.1, 0.2, margin)
+    assert 10 < len(every.vertex) < 800
+    found = 0
+    for k in range(900):
+        alone = collider.touch(before[k : k + 1], after[k : k + 1], 0.1, 0.2, margin[k])
+        if len(alone.vertex):
+            point, normal = kept(every, k)
+            assert np.allclose(alone.point, point, atol=1e-13)
+            assert np.allclose(alone.normal, normal, atol=1e-13)
+            found += 1
+    assert found == len(every.vertex)
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.05])
+def test_a_plane_at_rest_holds_who_it_would_hold_in_motion(reach):
+    plane = Plane((0.1, 0.2, 0.3), (1.0, 2.0, -0.5), thickness=0.01)
+    before = points(2000, 21)
+    after = before + 0.2 * points(2000, 22)
+    rest, other = plane.touch(before, after, 0.0, 0.1, reach), Collider.touch(plane, before, after, 0.0, 0.1, reach)
+    assert (rest.vertex == other.vertex).all()
+    assert np.allclose(rest.normal, other.normal)
+    room = np.einsum("ki,ki->k", rest.point - other.point, rest.normal)
+    assert np.abs(room).max() < 1e-13
 
 
 @pytest.mark.parametrize("name", SHAPES)

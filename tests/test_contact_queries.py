@@ -322,6 +322,47 @@ def test_containing_tets_leave_out_those_of_the_vertex(rng):
     np.testing.assert_array_equal(others[0], found)
 
 
+@pytest.mark.parametrize("rings", [2, 8])  # lists short enough to be noted, and longer ones
+def test_long_lists_of_what_is_left_out(rings):
+    x, triangles = ball.X, ball.surface
+    edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0).astype(np.int32)
+    v = np.unique(triangles)
+    start, ids = near = neighbourhoods(triangles, len(x), rings)
+    found, _, distance = closest_triangles(BoxTree(x, triangles), x, x[v], 1.5, vertex=v, excluded=near)
+    every = distances(x, triangles, x[v])
+    for k, w in enumerate(v):
+        every[k, ids[start[w] : start[w + 1]]] = np.inf
+    lowest = (every <= every.min(1, keepdims=True) + 1e-13).argmax(1)
+    np.testing.assert_array_equal(found, np.where(every.min(1) <= 1.5, lowest, -1))
+    np.testing.assert_allclose(distance, np.where(every.min(1) <= 1.5, every.min(1), np.inf), atol=1e-12)
+    start, ids = near = neighbourhoods(edges, len(x), rings)
+    assert (np.diff(start).max() > 200) == (rings > 2)
+    tree = BoxTree(x, edges)
+    found, _, _, distance = closest_edges(tree, x, edges, 1.5, excluded=near)
+    for k in range(0, len(edges), 7):
+        out = np.concatenate([ids[start[w] : start[w + 1]] for w in edges[k]])
+        rest = np.setdiff1d(np.arange(len(edges)), out)
+        alone = closest_edges(BoxTree(x, edges[rest]), x, edges[k : k + 1], 1.5)
+        assert found[k] == (rest[alone[0][0]] if alone[0][0] >= 0 else -1)
+        assert distance[k] == alone[3][0]
+
+
+def test_it_does_not_matter_what_is_asked_together(rng):
+    """Neither near points of one group, nor far ones of several, nor in which order."""
+    x, triangles = soup(rng)
+    group, own, meets = rng.integers(0, 5, len(triangles)), np.sort(rng.integers(0, 5, 600)), ~np.eye(5, dtype=bool)
+    tree = BoxTree(x, triangles, group)
+    p, reach = rng.random((600, 3)) + 0.2 * own[:, None], rng.choice([-1.0, 0.05, 0.3, np.inf], 600)
+    together = closest_triangles(tree, x, p, reach, own=own, meets=meets)
+    order = rng.permutation(600)
+    apart = closest_triangles(tree, x, p[order], reach[order], own=own[order], meets=meets)
+    for a, b in zip(together, apart):
+        np.testing.assert_array_equal(a[order], b)
+    for k in range(0, 600, 10):
+        alone = closest_triangles(tree, x, p[k : k + 1], reach[k : k + 1], own=own[k : k + 1], meets=meets)
+        assert alone[0][0] == together[0][k]
+
+
 def test_boxes_follow_motion(rng):
     """After a refit trees find what fresh ones find; boxes hold all that they should, and no more."""
     x, triangles = soup(rng, 5000, 0.02)

@@ -73,9 +73,10 @@ def test_a_sheet_that_lies_flush_on_a_box_is_not_inside():
     scene.pin(box.where(y=0))
     cloth = scene.add(pbng.shapes.sheet((0.5, 0.5), 5, origin=(0.25, 1.0, 0.25)), CLOTH, name="cloth")
     scene.contact()
-    *_, last = pbng.simulate(scene, pbng.PBNG(), pbng.Budget(iterations=20), frames=6, inertia=True, substeps=2)
-    assert last.contact.pairs > 0
-    assert last.x[cloth.start :, 1].min() > last.x[: cloth.start, 1].max() - 1e-3
+    frames = [*pbng.simulate(scene, pbng.PBNG(), pbng.Budget(iterations=20), frames=10, inertia=True, substeps=2)]
+    assert max(f.contact.pairs for f in frames[6:]) > 3  # it has sprung up to its thickness, and fallen back
+    for f in frames:
+        assert f.x[cloth.start :, 1].min() > f.x[: cloth.start, 1].max() - 1e-3
 
 
 @pytest.mark.parametrize(

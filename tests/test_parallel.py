@@ -4,6 +4,7 @@ import numba
 import numpy as np
 import pytest
 
+from pbng import parallel
 from pbng.parallel import array, body, rows, run, scratch
 
 
@@ -93,3 +94,8 @@ def test_scratch_is_each_calls_own(threads):
     np.testing.assert_array_equal(target, source + np.arange(n)[:, None])
     np.testing.assert_array_equal(address % 64, 0)
     assert np.abs(address[:, 0] - address[:, 1]).min() >= 40
+
+
+def test_addresses_are_those_of_the_data():
+    for a in (np.arange(5.0), np.arange(6.0).reshape(2, 3)[1:], np.empty(0), np.zeros((3, 0), np.int32)):
+        assert parallel._word(id(a) + parallel._HEAD).value == a.__array_interface__["data"][0]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pbng.contact.contacts import Contacts
-from pbng.contact.detection import Detector
+from pbng.contact.detection import Beginning, Detector
 from pbng.errors import InputError
 from pbng.problem import Problem
 from pbng.solvers.base import Budget, Method, Monitor, Result, Solver, Status
@@ -83,10 +83,11 @@ class Toucher:
             if not self.checked:
                 self.detector.check(x0, t0)
                 self.checked = True
+            borne = None
             if self.detector.rubs:
-                self.detector.borne = self.method.borne() if self.inherited is None else self.inherited
+                borne = self.method.borne() if self.inherited is None else self.inherited
                 self.inherited = None
-            self.contacts = self.detector.find(x0, x1, t0, t1, **options)
+            self.contacts = self.detector.find(x0, x1, t0, t1, borne=borne, **options)
         self.seconds += time.perf_counter() - start
         return self.contacts
 
@@ -104,7 +105,7 @@ class Toucher:
         clearance = c.clearance(x)
         touching = clearance < 0
         depth = -clearance[touching]
-        walls = (c.plane * x[c.vertex]).sum(1) - c.level <= 1e-6 * self.size
+        walls = c.height(x) <= 1e-6 * self.size
         vertices = np.unique(np.concatenate([c.vertices[touching].ravel(), c.vertex[walls]]))
         recolored, repacked, packing = (b - a for a, b in zip(self.before, self._work()))
         return ContactReport(
@@ -181,10 +182,12 @@ def equilibrium(
     results: list[Result] = []
     left, state, start = budget, placed, x
     before: np.ndarray | None = x
+    since: Beginning | None = None
     ahead, far, moved = toucher.size, toucher.detector.reach, [0.0]  # at first anything may come to touch
     hold = HOLD
     for _ in range(ROUNDS):
-        contacts = toucher.find(start, state, t0, t, ahead=ahead, hold=hold)
+        contacts = toucher.find(start, state, t0, t, ahead=ahead, hold=hold, since=since)
+        since = since or Beginning(x, t0, contacts)
         state = begun = contacts.put_outside(state)
 
         def leave(x: np.ndarray, begun: np.ndarray = begun) -> bool:

@@ -148,21 +148,24 @@ class Collider(ABC):
         before, after = np.asarray(before, float), np.asarray(after, float)
         margin = np.broadcast_to(np.asarray(reach, float), len(before)) + self.thickness
         poses = self._poses(t0, t1)
-        every = np.arange(len(before))
-        if poses[0] is poses[-1]:  # at rest: most points are too far away, and quickly told
-            d = self._clearance(to_body(poses[0], before))
-            every = np.flatnonzero(d <= margin + norms(after - before))
-            before, after, margin = before[every], after[every], margin[every]
-        path = [to_body(p, (1 - f) * before + f * after) for f, p in zip(np.linspace(0, 1, len(poses)), poses)]
-        left = path[0] if poses[0] is poses[-1] else to_body(poses[-1], before)
+        rests = poses[0] is poses[-1]
+        moved = norms(after - before)  # most points are too far away, and quickly told
+        d = self._clearance(to_body(poses[0], before))
+        every = np.flatnonzero(d <= margin + moved + (0.0 if rests else _sway(poses, before, moved)))
+        before, after, margin, d = before[every], after[every], margin[every], d[every]
+        shares = np.linspace(0, 1, len(poses))[1:-1]
+        between = [to_body(p, (1 - f) * before + f * after) for f, p in zip(shares, poses[1:-1])]
+        path = [to_body(poses[0], before), *between, to_body(poses[-1], after)]
+        left = path[0] if rests else to_body(poses[-1], before)
         length = np.sum([norms(b - a) for a, b in pairwise(path)], axis=0)
-        d = self._near(path[0])[0]
         near = d <= margin + np.maximum(length, norms(left - path[0]))
         index = every[near]
         path, left, d, length, margin = [p[near] for p in path], left[near], d[near], length[near], margin[near]
 
         d1, point, normal = self._near(path[-1])
-        chosen = (d1 < margin) | (d < margin) | (self._near(left)[0] < margin)
+        chosen = (d1 < margin) | (d < margin)
+        if not rests:
+            chosen |= self._clearance(left) < margin
         inside = d < -ON_SURFACE * length
         _, point[inside], normal[inside] = self._near(path[0][inside])
         open_ = np.flatnonzero(~inside & (d <= length))
@@ -171,14 +174,13 @@ class Collider(ABC):
             point[open_[hit]], normal[open_[hit]] = where[hit], direction[hit]
             chosen[open_[hit]] = True
             open_ = open_[~hit]
-        return self._touches(index, chosen | inside, point, normal, poses[-1])
+        chosen |= inside
+        return self._touches(index[chosen], point[chosen], normal[chosen], poses[-1])
 
-    def _touches(
-        self, index: np.ndarray, chosen: np.ndarray, X: np.ndarray, N: np.ndarray, pose: Pose | None
-    ) -> Touches:
-        """The contacts at points X with normals N of the body's frame."""
-        n = turned(pose, N[chosen])
-        return Touches(index[chosen], to_world(pose, X[chosen]) + self.thickness * n, n)
+    def _touches(self, index: np.ndarray, X: np.ndarray, N: np.ndarray, pose: Pose | None) -> Touches:
+        """What holds points at X with normals N of the body's frame."""
+        n = turned(pose, N)
+        return Touches(index, to_world(pose, X) + self.thickness * n, n)
 
     def carried(self, points: np.ndarray, t0: float, t1: float) -> np.ndarray:
         """How far the collider's material at points (k, 3) at time t1 has moved since t0 [m], (k, 3)."""
@@ -199,7 +201,7 @@ class Collider(ABC):
             if len(moving) == 0:
                 break
             d, closest, n = self._near(start[moving] + share[moving, None] * path[moving])
-            slope = np.einsum("ki,ki->k", n, path[moving])
+            slope = dots(n, path[moving])
             arrived = (d <= near[moving]) & (slope < 0)
             found = moving[arrived]
             hit[found], point[found], normal[found] = True, closest[arrived], n[arrived]
@@ -246,6 +248,17 @@ def turn_rate(motion: Any, s0: float, s1: float) -> float:
     return max(float(np.linalg.norm(R)) for R in change) / (math.sqrt(2) * h)
 
 
+def _sway(poses: list[Pose | None], x: np.ndarray, moved: np.ndarray) -> float:
+    """How far [m] points at rest go in a body's frame at most, anywhere up to ``moved`` (k,) from x (k, 3)."""
+    if len(x) == 0:
+        return 0.0
+    middle = np.full(len(x), 1 / len(x)) @ x
+    radius = (norms(x - middle) + moved).max()
+    turns = [np.eye(3) if p is None else p[0] for p in poses]
+    ways = (np.linalg.norm(to_body(q, middle) - to_body(p, middle)) for p, q in pairwise(poses))
+    return float(sum(ways) + radius * sum(np.linalg.norm(S - R) for R, S in pairwise(turns)))
+
+
 def to_body(pose: Pose | None, x: np.ndarray) -> np.ndarray:
     """World to body frame; no pose is that of rest."""
     return x if pose is None else (x - pose[1]) @ pose[0]
@@ -261,6 +274,12 @@ def turned(pose: Pose | None, N: np.ndarray) -> np.ndarray:
     return N if pose is None else N @ pose[0].T
 
 
+def dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Dot products (k,) of vectors (k, 3)."""
+    products = a * b
+    return products[:, 0] + products[:, 1] + products[:, 2]  # a fraction of the time of a sum over the axis
+
+
 def norms(v: np.ndarray) -> np.ndarray:
     """Lengths (k,) of vectors (k, 3)."""
-    return np.sqrt(np.einsum("ki,ki->k", v, v))
+    return np.sqrt(dots(v, v))

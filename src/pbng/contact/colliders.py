@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pbng.checks import checked_number, checked_vector
-from pbng.contact.collider import Collider, is_rigid, norms
+from pbng.contact.collider import Collider, Touches, is_rigid, norms, to_body
 from pbng.errors import InputError
 from pbng.motions import Affine
 
@@ -51,6 +51,17 @@ class Plane(Collider):
         n = np.array(self.normal)
         return X @ n - self._center @ n
 
+    def touch(self, before: np.ndarray, after: np.ndarray, t0: float, t1: float, reach: Any = 0.0) -> Touches:
+        """As of other colliders; wherever a path meets a plane at rest, the half-space is the same."""
+        poses = self._poses(t0, t1)
+        if poses[0] is not poses[-1]:
+            return super().touch(before, after, t0, t1, reach)
+        end = to_body(poses[-1], np.asarray(after, float))
+        d0, d1 = self._clearance(to_body(poses[0], np.asarray(before, float))), self._clearance(end)
+        chosen = (np.minimum(d0, d1) < np.asarray(reach, float) + self.thickness) | ((d1 <= 0) & (d1 < d0))
+        index = np.flatnonzero(chosen)
+        return self._touches(index, *self._near(end[index])[1:], poses[-1])
+
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         (u, v), (a, b) = _across(np.array(self.normal)), np.asarray(self.size) / 2
         corners = [self._center + i * a * u + j * b * v for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -75,6 +86,9 @@ class Sphere(Collider):
 
     def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return _rounded(X, self._center, self.radius, np.array([0.0, 1.0, 0.0]))
+
+    def _clearance(self, X: np.ndarray) -> np.ndarray:
+        return norms(X - self._center) - self.radius
 
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         points, triangles = _capsule_mesh(0.0, self.radius)

@@ -15,11 +15,13 @@ import numpy as np
 import scipy.sparse
 
 from pbng.constraints import stencil_hessian
+from pbng.contact.collider import dots, norms
+from pbng.contact.halfspaces import HalfSpaces
+from pbng.jit import serial
 
 CORNERS = 4  # vertices of a stencil: a vertex and a triangle, or two edges
 NEVER = -1e30  # offset [m] of a contact that does not resist
 PARTINGS = 4  # rounds in which what overlaps is moved apart
-ROUNDS = 64  # of projections onto the half-spaces of one vertex, at most
 
 
 def _none(*shape: int, dtype: type = float) -> np.ndarray:
@@ -81,13 +83,16 @@ class Contacts:
 
     def clearance(self, x: np.ndarray) -> np.ndarray:
         """How much farther apart each contact is at x (n_vert, 3) than it is to be kept [m], (m,)."""
-        C = np.einsum("mj,mji->mi", self.weights, x[self.vertices])
-        return (self.normal * C).sum(1) - self.kept
+        return self._along(x) - self.kept
+
+    def height(self, x: np.ndarray) -> np.ndarray:
+        """How far inside of each half-space its vertex is at x (n_vert, 3) [m], (k,)."""
+        return HalfSpaces(self.vertex, self.plane).height(x, self.level)
 
     def put_outside(self, x: np.ndarray) -> np.ndarray:
         """A copy of x (n_vert, 3) with every vertex in its half-spaces."""
         x = np.array(x, float)
-        move_in(x, self.vertex, self.plane, self.level)
+        HalfSpaces(self.vertex, self.plane).move_in(x, self.level)
         return x
 
     def parted(self, x: np.ndarray, fixed: np.ndarray) -> np.ndarray | None:
@@ -101,19 +106,22 @@ class Contacts:
         w = np.where(fixed[self.vertices], 0.0, self.weights)
         weight2 = (w * w).sum(1)
         for _ in range(PARTINGS):
-            C = np.einsum("mj,mji->mi", self.weights, x[self.vertices])
-            gap = (self.normal * C).sum(1) - self.offset
+            gap = self._along(x) - self.offset
             c = np.flatnonzero((gap < 0) & (weight2 > 0))
             if len(c) == 0:
                 break
             none = False
-            push = (-gap[c] / weight2[c])[:, None, None] * w[c][:, :, None] * self.normal[c][:, None]
-            moved, count = np.zeros_like(x), np.zeros(len(x))
-            np.add.at(moved, self.vertices[c], push)
-            np.add.at(count, self.vertices[c], w[c] != 0)
-            x += moved / np.maximum(count, 1)[:, None]
-        move_in(x, self.vertex, self.plane, self.level)
-        return None if none else x
+            push = (-gap[c] / weight2[c])[:, None] * self.normal[c]
+            moved, count = np.zeros_like(x), np.zeros((len(x), 1))
+            _spread(w[c], self.vertices[c], push, moved)
+            _spread((w[c] != 0).astype(float), self.vertices[c], np.ones((len(c), 1)), count)
+            some = np.flatnonzero(count)
+            x[some] += moved[some] / count[some]
+        return None if none else self.put_outside(x)
+
+    def _along(self, x: np.ndarray) -> np.ndarray:
+        """n·C at x (n_vert, 3) [m], (m,)."""
+        return dots(self.normal, _between(self.weights, self.vertices, x))
 
 
 class ContactEnergy:
@@ -127,71 +135,70 @@ class ContactEnergy:
     """
 
     def __init__(self, contacts: Contacts, n: int, slot: np.ndarray, origin: np.ndarray) -> None:
-        c, m = contacts, len(contacts.vertices)
-        row = np.repeat(np.arange(m), CORNERS)
-        entries = c.weights.ravel(), (row, slot[c.vertices].ravel())
-        self.weights = scipy.sparse.csr_matrix(entries, (m, n))
-        self.spread = self.weights.T.tocsr()
+        c, self.n = contacts, n
+        self.vertices, self.weights = slot[c.vertices], c.weights
         self.reach = np.sqrt((c.weights**2).sum(1))  # norm of each contact's weights
         self.normal, self.offset, self.k_n, self.k_tau, self.start = c.normal, c.offset, c.k_n, c.k_tau, c.start
         self.sticks = bool(c.k_tau.any())
-        self.vertex, self.plane = slot[c.vertex], c.plane
+        self.walls = HalfSpaces(slot[c.vertex], c.plane)
+        self.vertex, self.plane = self.walls.vertex, self.walls.plane
         self.level = c.level - c.plane @ origin
         self.friction, self.anchor, self.creep = c.friction, c.anchor - origin, c.creep
         self.rubs = bool(c.friction.any())
 
     def energy(self, x: np.ndarray) -> float:
         """Energy [J] at x (n, 3)."""
-        C, depth = self._gaps(x)
-        energy = 0.5 * float((self.k_n * depth * depth).sum())
-        if self.sticks:
-            energy += 0.5 * float((self.k_tau * (self._slipped(C) ** 2).sum(1)).sum())
+        energy = 0.0
+        if len(self.k_n):
+            C, gap = self._gaps(x)
+            depth = np.minimum(gap, 0.0)
+            energy += 0.5 * float(self.k_n @ (depth * depth))
+            if self.sticks:
+                u = self._slipped(C)
+                energy += 0.5 * float(self.k_tau @ dots(u, u))
         if self.rubs:
-            energy += float((self.friction * (self._slid(x)[1] - self.creep)).sum())
+            energy += float(self.friction @ (self._slid(x)[1] - self.creep))
         return energy
 
     def forces(self, x: np.ndarray) -> tuple[np.ndarray, float]:
         """Forces (n, 3) [N], and the sum of the norms of all contacts' forces [N]."""
-        C, depth = self._gaps(x)
-        pull = (self.k_n * depth)[:, None] * self.normal
-        if self.sticks:
-            pull += self.k_tau[:, None] * self._slipped(C)
-        f, scale = -(self.spread @ pull), float((np.linalg.norm(pull, axis=1) * self.reach).sum())
+        f, scale = np.zeros((self.n, 3)), 0.0
+        if len(self.k_n):
+            C, gap = self._gaps(x)
+            pull = (self.k_n * np.minimum(gap, 0.0))[:, None] * self.normal
+            if self.sticks:
+                pull += self.k_tau[:, None] * self._slipped(C)
+            _spread(self.weights, self.vertices, -pull, f)
+            scale += float(self.reach @ norms(pull))
         if self.rubs:
             u, length = self._slid(x)
-            rub = -(self.friction / length)[:, None] * u
-            np.add.at(f, self.vertex, rub)
-            scale += float(np.linalg.norm(rub, axis=1).sum())
+            rub = (self.friction / length)[:, None] * u
+            np.subtract.at(f, self.vertex, rub)
+            scale += float(norms(rub).sum())
         return f, scale
 
     def balance(self, f: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Take from forces f (n, 3) at x (n, 3), in place, what half-spaces that are touched bear, (k,) [N]."""
-        borne, touched = np.zeros(len(self.vertex)), np.flatnonzero(self.held(x, tolerance))
         # What is left is the part of a force along which its vertex could move: its projection onto a cone.
-        borne[touched] = move_in(f, self.vertex[touched], self.plane[touched], np.zeros(len(touched)))
-        return borne
+        return self.walls.move_in(f, np.where(self.held(x, tolerance), 0.0, -np.inf))
 
     def put_outside(self, x: np.ndarray, held: np.ndarray | None = None) -> None:
         """Move x (n, 3), of any precision, into the half-spaces, in place; onto the planes of those ``held`` (k,)."""
-        if len(self.vertex):
-            which = np.unique(self.vertex)
-            local = np.searchsorted(which, self.vertex)
-            moved = np.array(x[which], float)
-            move_in(moved, local, self.plane, self.level, held)
-            x[which] = moved
+        self.walls.move_in(x, self.level, held)
 
     def held(self, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Which half-spaces are touched at x to within a tolerance [m], (k,) bool."""
-        return (self.plane * x[self.vertex]).sum(1) - self.level <= tolerance
+        return self.walls.height(x, self.level) <= tolerance
 
     def stiffness(self, x: np.ndarray, n: int) -> np.ndarray:
         """A third of the trace of each node's Hessian [N/m] at x, of the first n nodes."""
-        active = self._gaps(x)[1] < 0
-        k = (np.where(active, self.k_n, 0.0) + 2 * self.k_tau) / 3
-        stiffness = np.asarray(self.spread.power(2) @ k)
+        stiffness = np.zeros((self.n, 1))
+        if len(self.k_n):
+            k = (np.where(self._gaps(x)[1] < 0, self.k_n, 0.0) + 2 * self.k_tau) / 3
+            _spread(self.weights**2, self.vertices, k[:, None], stiffness)
         if self.rubs:
-            np.add.at(stiffness, self.vertex, 2 / 3 * self.friction / self._slid(x)[1])
-        return stiffness[:n]
+            np.add.at(stiffness[:, 0], self.vertex, 2 / 3 * self.friction / self._slid(x)[1])
+        return stiffness[:n, 0]
 
     def active(self, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Which contacts resist at x, and which half-spaces are touched to within a tolerance [m], (m + k,) bool."""
@@ -216,7 +223,10 @@ class ContactEnergy:
         sticks = np.minimum(self.friction / self._slid(x)[1], bearing[self.vertex])[held]
         walls = bearing[v][:, None, None] * across + sticks[:, None, None] * (unit - across)
         at = scipy.sparse.csr_matrix((np.ones(len(v)), (np.arange(len(v)), v)), (len(v), k))
-        W = scipy.sparse.vstack([self.weights[used][:, :k], at]).tocsr() @ U
+        rows = np.arange(0, CORNERS * len(used) + 1, CORNERS)
+        entries = self.weights[used].ravel(), self.vertices[used].ravel(), rows
+        between = scipy.sparse.csr_matrix(entries, (len(used), self.n))[:, :k]
+        W = scipy.sparse.vstack([between, at]).tocsr() @ U
         return stencil_hessian(W, np.concatenate([K[used], walls]))
 
     def closing(self, x: np.ndarray, active: np.ndarray, bearing: np.ndarray) -> np.ndarray:
@@ -225,57 +235,52 @@ class ContactEnergy:
         With them the springs of :meth:`hessian` are at rest where the gap is zero, not where it is now.
         """
         m = len(self.k_n)
-        gap = np.maximum((self.normal * (self.weights @ x)).sum(1) - self.offset, 0.0)
-        f = -(self.spread @ ((active[:m] * self.k_n * gap)[:, None] * self.normal))
-        height = np.maximum((self.plane * x[self.vertex]).sum(1) - self.level, 0.0)
+        gap = np.maximum(self._gaps(x)[1], 0.0)
+        f = np.zeros((self.n, 3))
+        _spread(self.weights, self.vertices, -(active[:m] * self.k_n * gap)[:, None] * self.normal, f)
+        height = np.maximum(self.walls.height(x, self.level), 0.0)
         np.add.at(f, self.vertex, -(active[m:] * bearing[self.vertex] * height)[:, None] * self.plane)
         return f
 
     def _gaps(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """C (m, 3), and min(gap, 0) (m,)."""
-        C = self.weights @ x
-        return C, np.minimum((self.normal * C).sum(1) - self.offset, 0.0)
+        """C (m, 3) and the gap (m,) of each contact."""
+        C = _between(self.weights, self.vertices, x)
+        return C, dots(self.normal, C) - self.offset
 
     def _slid(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far each vertex has slid along its half-space, (k, 3), and sqrt(|u|² + ε²)."""
-        u = x[self.vertex] - self.anchor
-        u = u - (self.plane * u).sum(1)[:, None] * self.plane
-        return u, np.sqrt((u * u).sum(1) + self.creep**2)
+        u = _across(x[self.vertex] - self.anchor, self.plane)
+        return u, np.sqrt(dots(u, u) + self.creep**2)
 
     def _slipped(self, C: np.ndarray) -> np.ndarray:
-        u = C - self.start
-        return u - (self.normal * u).sum(1)[:, None] * self.normal
+        return _across(C - self.start, self.normal)
 
 
-def move_in(
-    x: np.ndarray, vertex: np.ndarray, plane: np.ndarray, level: np.ndarray, held: np.ndarray | None = None
-) -> np.ndarray:
-    """Move each vertex to the nearest point of its half-spaces, in place (Dykstra's projections).
+def _between(weights: np.ndarray, vertices: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """C = Σ_j w_j x_j of stencils (m, 4) at x (n, 3) [m], (m, 3)."""
+    C = np.empty((len(vertices), 3))
+    _interpolate(weights, vertices, x, C)
+    return C
 
-    Args:
-        x: Positions (n, 3), float64.
-        vertex, plane, level: The half-spaces, as of :class:`Contacts`, (k,), (k, 3), (k,).
-        held: Of which of them (k,) the vertex is moved onto the plane, whichever side it is on.
 
-    Returns:
-        How far each half-space has pushed its vertex, (k,): x is what it was plus Σ pushed n.
-    """
-    pushed = np.zeros(len(vertex))
-    least = np.zeros(len(vertex)) if held is None else np.where(held, -np.inf, 0.0)
-    order = np.argsort(vertex, kind="stable")
-    turn = np.empty(len(vertex), np.int64)  # half-spaces of one vertex take turns
-    turn[order] = np.arange(len(vertex)) - np.searchsorted(vertex[order], vertex[order])
-    several = np.isin(vertex, vertex[turn > 0])  # one alone is done at once
-    for number in range(ROUNDS):
-        change = 0.0
-        for t in range(int(turn.max(initial=-1)) + 1):
-            mine = np.flatnonzero((turn == t) & several) if number else np.flatnonzero(turn == t)
-            v, n = vertex[mine], plane[mine]
-            now = np.maximum(level[mine] - (n * x[v]).sum(1) + pushed[mine], least[mine])
-            step = now - pushed[mine]
-            x[v] += step[:, None] * n
-            pushed[mine] = now
-            change = max(change, float(np.abs(step).max(initial=0.0)))
-        if not several.any() or change <= 1e-9 * float(np.abs(pushed).max()):
-            break
-    return pushed
+@serial
+def _interpolate(weights, vertices, x, C):
+    for m in range(len(C)):
+        for i in range(3):
+            C[m, i] = 0.0
+            for j in range(CORNERS):
+                C[m, i] += weights[m, j] * x[vertices[m, j], i]
+
+
+@serial
+def _spread(weights, vertices, values, out):
+    """Add the values of stencils (m, l), times their weights, to those of their vertices, out (n, l)."""
+    for m in range(len(values)):
+        for j in range(CORNERS):
+            for i in range(out.shape[1]):
+                out[vertices[m, j], i] += weights[m, j] * values[m, i]
+
+
+def _across(u: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """The part of vectors (k, 3) across unit normals (k, 3)."""
+    return u - dots(n, u)[:, None] * n

@@ -1,16 +1,26 @@
 """Everything that may touch in a step: surfaces each other, and colliders."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from pbng.contact.collider import Touches
-from pbng.contact.contacts import Contacts, move_in
+from pbng.contact.collider import Touches, dots, norms
+from pbng.contact.contacts import Contacts
+from pbng.contact.halfspaces import HalfSpaces
 from pbng.contact.pairs import SurfaceDetector
 from pbng.contact.spec import CLOSE, NEAR, ContactSpec
 from pbng.errors import InputError
 
 CREEP = 1e-3  # of the margin: ways shorter than this do not count as sliding
+
+
+class Beginning(NamedTuple):
+    """How a step began that goes on: at positions x (n_vert, 3) [m], at time t [s], with these contacts."""
+
+    x: np.ndarray
+    t: float
+    contacts: Contacts
 
 
 class Detector:
@@ -28,9 +38,6 @@ class Detector:
         self.free = spec.surface[~fixed[spec.surface]]
         self.reach = self.surfaces.radius if self.surfaces else spec.margin  # farther off, directions are of no use [m]
         self.rubs = any(c.friction for c in spec.colliders)
-        self.ties = Contacts()  # between surfaces, since the last step began
-        self.since: tuple[np.ndarray, float] | None = None  # where the last step began, and when [s]
-        self.borne = np.zeros((len(X), 3))  # with what force [N] colliders bear each vertex, as far as it rubs
 
     def check(self, x: np.ndarray, t: float) -> None:
         """InputError if a body lies wholly inside another, or inside a collider at time t [s], at x (n_vert, 3)."""
@@ -54,81 +61,75 @@ class Detector:
         dt: float | None = None,
         ahead: float = 0.0,
         hold: float = 0.0,
+        borne: np.ndarray | None = None,
+        since: Beginning | None = None,
     ) -> Contacts:
         """Contacts of a step from x0 at time t0 to, it is expected, x1 at t1 (n_vert, 3).
 
         ``dt`` is for motion and ``hold`` for rest, as of :meth:`pbng.contact.pairs.SurfaceDetector.find`; ``ahead`` [m]
-        is how far from x1 vertices may come to lie. With t0 = t1 the step goes on in which contacts were sought last:
-        friction counts from where that began.
+        is how far from x1 vertices may come to lie. ``borne`` (n_vert, 3) is with what force [N] colliders bear
+        vertices, by which they rub; in a step that goes on, friction counts ``since`` it began.
         """
-        begins = t0 < t1 or self.since is None
-        if begins:
-            self.since = x0, t0
-        found = self._between_surfaces(x0, x1, dt, ahead, hold, begins) if self.surfaces else Contacts()
-        before, after, near = x0[self.free], x1[self.free], np.asarray(self.spec.margin + ahead)
+        found = self._between_surfaces(x0, x1, dt, ahead, hold, since) if self.surfaces else Contacts()
+        if not self.spec.colliders:
+            return found
+        before, after, near = np.take(x0, self.free, 0), np.take(x1, self.free, 0), np.asarray(self.spec.margin + ahead)
         if dt is not None:
-            near = CLOSE / NEAR * self.spec.margin + np.linalg.norm(after - before, axis=1)
+            near = CLOSE / NEAR * self.spec.margin + norms(after - before)
         touches = [c.touch(before, after, t0, t1, near) for c in self.spec.colliders]
-        if touches:
-            normal = np.concatenate([t.normal for t in touches])
-            vertex = self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32)
-            level = (normal * np.concatenate([t.point for t in touches])).sum(1)
-            normal, level = self._cut(x0, vertex, normal, level)
-            found = replace(
-                found,
-                vertex=vertex,
-                plane=normal,
-                level=level,
-                friction=self._friction(touches, vertex, normal),
-                anchor=self._anchors(touches, vertex, t1),
-                creep=CREEP * self.spec.margin,
-            )
-        return found
+        normal = np.concatenate([t.normal for t in touches])
+        vertex = self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32)
+        level = dots(normal, np.concatenate([t.point for t in touches]))
+        self._cut(x0, vertex, normal, level)
+        start, earlier = (x0, t0) if since is None else (since.x, since.t)
+        return replace(
+            found,
+            vertex=vertex,
+            plane=normal,
+            level=level,
+            friction=self._friction(touches, vertex, normal, borne),
+            anchor=start[vertex] + self._slips(touches, earlier, t1),
+            creep=CREEP * self.spec.margin,
+        )
 
     def _between_surfaces(
-        self, x0: np.ndarray, x1: np.ndarray, dt: float | None, ahead: float, hold: float, begins: bool
+        self, x0: np.ndarray, x1: np.ndarray, dt: float | None, ahead: float, hold: float, since: Beginning | None
     ) -> Contacts:
         """Contacts between surfaces. What the rule of the scene makes stick does so from where a step began."""
         assert self.surfaces is not None
         k_tau = self.surfaces.surfaces.k_tau
         if dt is not None or k_tau == 0:
             return self.surfaces.find(x0, x1, dt, ahead, hold, k_tau)
-        if begins:
-            found = self.surfaces.find(x0, x1, dt, ahead, 0.0, k_tau)
-            self.ties = found.ties()
-            return found
-        return self.surfaces.find(x0, x1, dt, ahead, hold, 0.0).plus(self.ties)
+        if since is None:
+            return self.surfaces.find(x0, x1, dt, ahead, 0.0, k_tau)
+        return self.surfaces.find(x0, x1, dt, ahead, hold, 0.0).plus(since.contacts.ties())
 
-    def _friction(self, touches: list[Touches], vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    def _friction(
+        self, touches: list[Touches], vertex: np.ndarray, normal: np.ndarray, borne: np.ndarray | None
+    ) -> np.ndarray:
         """What friction may bear of each half-space [N]: its coefficient times what was last borne along the normal."""
         coefficient = np.repeat([c.friction for c in self.spec.colliders], [len(t.vertex) for t in touches])
-        if not coefficient.any():
-            return coefficient
-        which, local = np.unique(vertex, return_inverse=True)
-        return coefficient * move_in(-self.borne[which], local, normal, np.zeros(len(local)))
+        if borne is None or not coefficient.any():
+            return np.zeros(len(vertex))
+        return coefficient * HalfSpaces(vertex, normal).move_in(-borne, np.zeros(len(vertex)))
 
-    def _cut(
-        self, x: np.ndarray, vertex: np.ndarray, normal: np.ndarray, level: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Half-spaces as vertices of plane bodies see them: cut by their plane, in which they stay."""
-        flat = np.flatnonzero(np.isin(vertex, self.spec.plane))
+    def _cut(self, x: np.ndarray, vertex: np.ndarray, normal: np.ndarray, level: np.ndarray) -> None:
+        """Make half-spaces, in place, what vertices of plane bodies see: cut by their plane, in which they stay."""
+        flat = np.flatnonzero(np.isin(vertex, self.spec.plane)) if len(self.spec.plane) else self.spec.plane
         if len(flat):
             level[flat] -= normal[flat, 2] * x[vertex[flat], 2]
             normal[flat, 2] = 0.0
-            length = np.linalg.norm(normal[flat], axis=1)
+            length = norms(normal[flat])
             length[length == 0] = 1.0  # it is parallel to the plane, and nothing can be done
             normal[flat] /= length[:, None]
             level[flat] /= length
             aside = flat[(normal[flat] == 0).all(1)]
             level[aside] = -np.inf
-        return normal, level
 
-    def _anchors(self, touches: list[Touches], vertex: np.ndarray, t: float) -> np.ndarray:
-        """Where vertices would be at time t had they stuck to the colliders since the step began, (k, 3) [m]."""
-        assert self.since is not None
-        x, t0 = self.since
+    def _slips(self, touches: list[Touches], t0: float, t1: float) -> np.ndarray:
+        """How far what would stick to the colliders is carried from time t0 to t1, where they rub, (k, 3) [m]."""
         slips = [
-            c.carried(q.point, t0, t) if c.friction else np.zeros((len(q.vertex), 3))
+            c.carried(q.point, t0, t1) if c.friction else np.zeros((len(q.vertex), 3))
             for c, q in zip(self.spec.colliders, touches)
         ]
-        return x[vertex] + np.concatenate(slips)
+        return np.concatenate(slips)

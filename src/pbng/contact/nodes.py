@@ -32,6 +32,7 @@ from pbng.packing import NODAL, Packed, Rows, aligned
 from pbng.parallel import array, body, rows, run, scratch
 from pbng.problem import Problem
 from pbng.sweep import aligned_part
+from pbng.topology import entries
 
 HELD = 1e30  # diagonal of the Hessian of a node that is swept elsewhere: it does not move
 ROOM = 1.25  # of what is laid out at once: so much comes later
@@ -69,7 +70,6 @@ class ContactNodes:
         self.blocks = Blocks(packed.dtype)
         self.owner = np.empty(0, np.int64)  # node of each lane; of padding lanes, one of the block
         self.lane = np.full(problem.n_vert, -1)  # of each node that has one
-        self.laid = 0  # nodes with lanes
 
     def update(self, contacts: Contacts) -> None:
         """Take the contacts of a new step."""
@@ -95,20 +95,25 @@ class ContactNodes:
     def _lay_out(self) -> None:
         """Give nodes that have none a lane, or where there is no room for them all that are in contact."""
         new = self.node[self.lane[self.node] < 0]
-        needed = -(-np.bincount(self.color[new]) // W).sum()
-        fits = needed <= self.blocks.room and 2 * len(self.node) >= self.laid
+        idle = len(self.owner) > 2 * W * self._n_block(self.node)
+        fits = self._n_block(new) <= self.blocks.room and not idle
         if len(new) and fits:
             fits = self._append(new)
         if not fits:
             outside = np.ones(self.problem.n_vert, bool)
             outside[self.node] = False
             self.color[outside] = self.problem.color[outside]
-            self.blocks, self.owner, self.laid = Blocks(self.packed.dtype), np.empty(0, np.int64), 0
+            self.blocks, self.owner = Blocks(self.packed.dtype), np.empty(0, np.int64)
             self.lane[:] = -1
             self._append(self.node)
 
+    def _n_block(self, node: np.ndarray) -> int:
+        """How many blocks nodes need."""
+        return int((-(-np.bincount(self.color[node]) // W)).sum())
+
     def _append(self, node: np.ndarray) -> bool:
         """Lay out nodes in blocks behind those that there are. Whether there is room."""
+        node = np.concatenate([node, self._next(node)])
         layout, order = self.packed.layout, node[np.argsort(self.rank[node])]
         color_start, owner = layout.numbering(order, self.color)
         if not self.blocks.append(color_start, layout.rows(owner, self.packed.places, len(owner) // W)):
@@ -116,9 +121,20 @@ class ContactNodes:
         real = owner >= 0
         self.lane[owner[real]] = len(self.owner) + np.flatnonzero(real)
         self.owner = np.concatenate([self.owner, np.where(real, owner, np.repeat(owner[::W], W))])
-        self.laid += len(node)
         self.repacked += len(node)
         return True
+
+    def _next(self, node: np.ndarray) -> np.ndarray:
+        """Neighbours of nodes for lanes that would be idle in their blocks: they are likely to be in contact next."""
+        start, neighbour = self.neighbours
+        beside = np.zeros(self.problem.n_vert, bool)
+        beside[neighbour[entries(start, node)[1]]] = True
+        beside[node] = False
+        near = np.flatnonzero(beside & (self.lane < 0) & ~self.problem.fixed)
+        near = near[np.argsort(self.color[near], kind="stable")]
+        color = self.color[near]
+        room = -np.bincount(self.color[node], minlength=int(color.max(initial=0)) + 1) % W
+        return near[np.arange(len(near)) - np.searchsorted(color, color) < room[color]]
 
     def _hold(self) -> None:
         """Hold the nodes in contact in the static layout, and no others."""

@@ -16,14 +16,30 @@ from math import sqrt
 import numpy as np
 
 from pbng.contact.bvh import DEPTH, BoxTree
+from pbng.contact.descent import (
+    SLOTS,
+    STACK,
+    STARTS,
+    begin,
+    common_ground,
+    find_starts,
+    is_listed,
+    is_noted,
+    lower_corner,
+    next_leaf,
+    note,
+    same_as,
+    slack_of,
+    squared,
+    upper_corner,
+)
 from pbng.contact.primitives import closest_on_triangle, closest_segments, tet_weights
-from pbng.jit import inline
 from pbng.linalg import cross, dot, point, sub
 from pbng.parallel import array, body, each, rows, scratch
 
 GRAIN = 128  # queries that a thread takes at a time
+BUNCH = 8  # queries in a row, which are best near each other, that begin their ways down the tree together
 NONE = 1 << 31  # above every number
-ROUNDING = 1e-14  # distances that differ by less, relative to themselves or to the size of the tree, are the same
 Excluded = tuple[np.ndarray, np.ndarray]
 
 
@@ -177,71 +193,6 @@ def _numbers(a: np.ndarray | None, k: int, end: int) -> np.ndarray:
     return a
 
 
-@inline
-def _gap2(boxes, i, low, high):
-    """Squared distance of box i from the box between two corners."""
-    dx = max(boxes[i, 0] - high[0], 0.0, low[0] - boxes[i, 3])
-    dy = max(boxes[i, 1] - high[1], 0.0, low[1] - boxes[i, 4])
-    dz = max(boxes[i, 2] - high[2], 0.0, low[2] - boxes[i, 5])
-    return dx * dx + dy * dy + dz * dz
-
-
-@inline
-def _squared(a):
-    return a * a
-
-
-@inline
-def _slack(boxes):
-    """A distance above the rounding errors of distances to what is in the tree [m]."""
-    return ROUNDING * (abs(boxes[0, 3] - boxes[0, 0]) + abs(boxes[0, 4] - boxes[0, 1]) + abs(boxes[0, 5] - boxes[0, 2]))
-
-
-@inline
-def _same(d2, slack):
-    """Between which squared distances another one is taken for the same as ``d2``."""
-    d = sqrt(d2)
-    least, most = max(d * (1.0 - ROUNDING) - slack, 0.0), d * (1.0 + ROUNDING) + slack
-    return least * least, most * most
-
-
-@inline
-def _is_listed(start, ids, v, t):
-    """Whether t is among the numbers of v."""
-    low, high = start[v], start[v + 1]
-    while low < high:
-        middle = (low + high) >> 1
-        if ids[middle] < t:
-            low = middle + 1
-        else:
-            high = middle
-    return low < start[v + 1] and ids[low] == t
-
-
-@inline
-def _next_leaf(nodes, boxes, meets, row, low, high, within, stack, gaps, top):
-    """The next leaf on the way, -1 for none, and how many nodes are left on the stack with their squared distances.
-
-    Of nodes that the groups of ``row`` meet, near ones first; none whose box is farther than √within from a box.
-    """
-    while top > 0:
-        top -= 1
-        i, gap = stack[top], gaps[top]
-        while gap <= within and (nodes[i, 3] < 0 or meets[row + nodes[i, 3]]):
-            child = nodes[i, 0]
-            if child < 0:
-                return i, top
-            near, far = _gap2(boxes, child, low, high), _gap2(boxes, child + 1, low, high)
-            i, child = child, child + 1
-            if far < near:
-                i, child, near, far = child, i, far, near
-            if far <= within:
-                stack[top], gaps[top] = child, far
-                top += 1
-            gap = near
-    return -1, top
-
-
 @body
 def _closest_triangles(arguments, low, high):
     """Body of :func:`closest_triangles` for points low .. high."""
@@ -256,9 +207,22 @@ def _closest_triangles(arguments, low, high):
     found, weights = array(arguments, 15, np.int32), rows(arguments, 16, 3, np.float64)
     distance = array(arguments, 17, np.float64)
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
-    stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
-    slack = _slack(boxes)
+    stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
+    starts, noted = scratch(STARTS, np.int32), scratch(SLOTS, np.int64)
+    slack = slack_of(boxes)
+    for j in range(SLOTS if listed else 0):
+        noted[j] = 0
+    n_start = 0
     for q in range(low, high):
+        if (q - low) % BUNCH == 0:
+            lowest, highest, last = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf), min(q + BUNCH, high)
+            for j in range(q, last):
+                if reach[j] >= 0.0:
+                    p = point(points, j)
+                    lowest, highest = lower_corner(lowest, p), upper_corner(highest, p)
+            farthest, together = common_ground(reach, own, n_group, grouped, q, last)
+            if farthest >= 0.0:
+                n_start = find_starts(nodes, boxes, meets, together, lowest, highest, farthest, starts, stack)
         found[q], distance[q] = -1, np.inf
         weights[q, 0] = weights[q, 1] = weights[q, 2] = 0.0
         if not reach[q] >= 0.0:
@@ -269,18 +233,27 @@ def _closest_triangles(arguments, low, high):
         u = v = w = 0.0
         best = least = most = np.inf
         within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
-        stack[0], gaps[0] = 0, _gap2(boxes, 0, p, p)
-        i, top = _next_leaf(nodes, boxes, meets, row, p, p, within, stack, gaps, 1)
-        while i >= 0:
+        top = begin(boxes, starts, n_start, p, p, within, stack, gaps)
+        left_out = start[vertex[q] + 1] - start[vertex[q]] if listed and top > 0 else 0
+        for j in range(left_out if 2 * left_out <= SLOTS else 0):
+            note(noted, q - low + 1, ids[start[vertex[q]] + j])
+        while True:
+            i, top = next_leaf(nodes, boxes, meets, row, p, p, within, stack, gaps, top)
+            if i < 0:
+                break
             for e in range(nodes[i, 1], nodes[i, 2]):
                 t = order[e]
-                if listed and _is_listed(start, ids, vertex[q], t):
-                    continue
+                if left_out > 0:
+                    if 2 * left_out > SLOTS:
+                        if is_listed(start, ids, vertex[q], t):
+                            continue
+                    elif is_noted(noted, q - low + 1, t):
+                        continue
                 a, b, c = point(x, cells[e, 0]), point(x, cells[e, 1]), point(x, cells[e, 2])
                 weight, offset, d2 = closest_on_triangle(p, a, b, c)
                 if not d2 <= most or (d2 >= least and t > closest):  # not a number is not found
                     continue
-                if d2 > _squared(reach[q] + max(margin[cells[e, 0]], margin[cells[e, 1]], margin[cells[e, 2]])):
+                if d2 > squared(reach[q] + max(margin[cells[e, 0]], margin[cells[e, 1]], margin[cells[e, 2]])):
                     continue
                 if behind and not dot(offset, cross(sub(b, a), sub(c, a))) > 0.0:
                     continue
@@ -288,9 +261,8 @@ def _closest_triangles(arguments, low, high):
                     continue
                 best, closest = d2, t
                 u, v, w = weight
-                least, most = _same(best, slack)
+                least, most = same_as(best, slack)
                 within = min(within, most)
-            i, top = _next_leaf(nodes, boxes, meets, row, p, p, within, stack, gaps, top)
         if closest < NONE:
             found[q], distance[q] = closest, sqrt(best)
             weights[q, 0], weights[q, 1], weights[q, 2] = u, v, w
@@ -308,40 +280,64 @@ def _closest_edges(arguments, low, high):
     s, t = array(arguments, 15, np.float64), array(arguments, 16, np.float64)
     distance = array(arguments, 17, np.float64)
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
-    stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
-    slack = _slack(boxes)
+    stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
+    starts, noted = scratch(STARTS, np.int32), scratch(SLOTS, np.int64)
+    slack = slack_of(boxes)
+    for j in range(SLOTS if listed else 0):
+        noted[j] = 0
+    n_start = 0
     for q in range(low, high):
+        if (q - low) % BUNCH == 0:
+            lowest, highest, last = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf), min(q + BUNCH, high)
+            for j in range(q, last):
+                if reach[j] >= 0.0:
+                    a, b = point(x, edges[j, 0]), point(x, edges[j, 1])
+                    lowest, highest = (
+                        lower_corner(lowest, lower_corner(a, b)),
+                        upper_corner(highest, upper_corner(a, b)),
+                    )
+            farthest, together = common_ground(reach, own, n_group, grouped, q, last)
+            if farthest >= 0.0:
+                n_start = find_starts(nodes, boxes, meets, together, lowest, highest, farthest, starts, stack)
         found[q], s[q], t[q], distance[q] = -1, 0.0, 0.0, np.inf
         if not reach[q] >= 0.0:
             continue
         v, w = edges[q, 0], edges[q, 1]
         a, b = point(x, v), point(x, w)
-        lowest = min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2])
-        highest = max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2])
+        lowest, highest = lower_corner(a, b), upper_corner(a, b)
         row = own[q] * n_group if grouped else 0
         closest = NONE
         along, across = 0.0, 0.0
         best = least = most = np.inf
         within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
-        stack[0], gaps[0] = 0, _gap2(boxes, 0, lowest, highest)
-        i, top = _next_leaf(nodes, boxes, meets, row, lowest, highest, within, stack, gaps, 1)
-        while i >= 0:
+        top = begin(boxes, starts, n_start, lowest, highest, within, stack, gaps)
+        left_out = start[v + 1] - start[v] + start[w + 1] - start[w] if listed and top > 0 else 0
+        if 2 * left_out <= SLOTS:
+            for j in range(start[v], start[v + 1] if left_out > 0 else start[v]):
+                note(noted, q - low + 1, ids[j])
+            for j in range(start[w], start[w + 1] if left_out > 0 else start[w]):
+                note(noted, q - low + 1, ids[j])
+        while True:
+            i, top = next_leaf(nodes, boxes, meets, row, lowest, highest, within, stack, gaps, top)
+            if i < 0:
+                break
             for e in range(nodes[i, 1], nodes[i, 2]):
+                edge = order[e]
                 c, d = cells[e, 0], cells[e, 1]
                 if c == v or c == w or d == v or d == w:  # noqa: SIM109 (a tuple would be searched)
                     continue
+                if left_out > 0 and 2 * left_out <= SLOTS and is_noted(noted, q - low + 1, edge):
+                    continue
                 s1, t1, _, d2 = closest_segments(a, b, point(x, c), point(x, d))
-                edge = order[e]
                 if not d2 <= most or (d2 >= least and edge > closest):
                     continue
-                if d2 > _squared(reach[q] + max(margin[c], margin[d])):
+                if d2 > squared(reach[q] + max(margin[c], margin[d])):
                     continue
-                if listed and (_is_listed(start, ids, v, edge) or _is_listed(start, ids, w, edge)):
+                if 2 * left_out > SLOTS and (is_listed(start, ids, v, edge) or is_listed(start, ids, w, edge)):
                     continue
                 best, closest, along, across = d2, edge, s1, t1
-                least, most = _same(best, slack)
+                least, most = same_as(best, slack)
                 within = min(within, most)
-            i, top = _next_leaf(nodes, boxes, meets, row, lowest, highest, within, stack, gaps, top)
         if closest < NONE:
             found[q], s[q], t[q], distance[q] = closest, along, across, sqrt(best)
 
@@ -368,7 +364,7 @@ def _containing_tets(arguments, low, high):
         v = vertex[q] if named else -1
         lowest = NONE
         stack[0], gaps[0] = 0, 0.0
-        i, top = _next_leaf(nodes, boxes, meets, row, p, p, 0.0, stack, gaps, 1)
+        i, top = next_leaf(nodes, boxes, meets, row, p, p, 0.0, stack, gaps, 1)
         while i >= 0:
             for e in range(nodes[i, 1], nodes[i, 2]):
                 t = order[e]
@@ -378,10 +374,10 @@ def _containing_tets(arguments, low, high):
                 (wa, wb, wc, wd), _ = tet_weights(p, point(x, a), point(x, b), point(x, c), point(x, d))
                 if not (wa >= 0.0 and wb >= 0.0 and wc >= 0.0 and wd >= 0.0):
                     continue
-                if listed and _is_listed(start, ids, v, t):
+                if listed and is_listed(start, ids, v, t):
                     continue
                 lowest = t
                 weights[q, 0], weights[q, 1], weights[q, 2], weights[q, 3] = wa, wb, wc, wd
-            i, top = _next_leaf(nodes, boxes, meets, row, p, p, 0.0, stack, gaps, top)
+            i, top = next_leaf(nodes, boxes, meets, row, p, p, 0.0, stack, gaps, top)
         if lowest < NONE:
             found[q] = lowest
