@@ -27,6 +27,7 @@ from pbng.mesh import triangle_areas
 from pbng.parallel import array, body, each, rows
 from pbng.topology import edge_sides
 
+FARTHER = 1.5  # than it is expected to go may a vertex go in a step with inertia
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
 ROOM = 1e-6  # of the distance that is kept, by which surfaces at rest may be too close
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
@@ -119,7 +120,7 @@ class SurfaceDetector:
         moved = np.sqrt(np.einsum("vi,vi->v", step, step))  # a norm along an axis takes four times as long
         radius = self.radius + min(ahead, AHEAD * self.radius)
         if dt is not None and s.radius is None:
-            radius, moved = CLOSE / NEAR * self.radius, 2 * moved
+            radius, moved = CLOSE / NEAR * self.radius, FARTHER * moved
         reach = radius + 2 * float(s.skin.max(initial=0.0)) + moved
         self.normals.fit(x0)
         self.triangles.refit(x0, margin=moved)
