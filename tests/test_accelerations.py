@@ -5,6 +5,7 @@ import pytest
 from conftest import twisted_bar
 
 import pbng
+from pbng.solvers.acceleration import MixingHistory
 
 DOUBLE = pbng.PBNG(dtype="float64")
 PLAIN = pbng.PBNG(acceleration=None, dtype="float64")
@@ -113,3 +114,24 @@ def test_symmetric_sweeps(bar):
     plain = pbng.solve(bar, PLAIN, pbng.Budget(iterations=20))
     both = pbng.solve(bar, pbng.PBNG(None, dtype="float64", symmetric=True), pbng.Budget(iterations=20))
     assert both.energy < plain.energy
+
+
+def test_mixtures_are_the_best_there_are(rng):
+    """Whatever the sizes of the differences, also where some are lost, alike or nearly alike."""
+    for k in range(300):
+        history, m = MixingHistory(5), int(rng.integers(1, 6))
+        F, f = rng.normal(size=(m, 30)) * 10.0 ** rng.uniform(-5, 5, size=(m, 1)), rng.normal(size=30)
+        if m > 1 and k % 3:
+            F[1] = F[0] * (1 + (k % 3 - 1) * 1e-4 * rng.normal(size=30))
+        if k % 7 == 0:
+            F[m - 1] = 0
+        history.count, history.gram[:m, :m], history.rhs[:m] = m, F @ F.T, F @ f
+        theta = history._weights()
+        if not F.any():
+            assert theta is None
+            continue
+        size = np.maximum(np.linalg.norm(F, axis=1), 1e-300)
+        best = f - np.linalg.lstsq((F / size[:, None]).T, f, rcond=1e-7)[0] @ (F / size[:, None])
+        assert np.linalg.norm(f - theta @ F) < np.linalg.norm(best) * (1 + 1e-6)
+    history.gram[0, 0] = np.nan
+    assert history._weights() is None

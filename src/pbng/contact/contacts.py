@@ -152,12 +152,12 @@ class ContactEnergy:
         if len(self.k_n):
             C, gap = self._gaps(x)
             depth = np.minimum(gap, 0.0)
-            energy += 0.5 * float(self.k_n @ (depth * depth))
+            energy += 0.5 * float((self.k_n * depth * depth).sum())
             if self.sticks:
                 u = self._slipped(C)
-                energy += 0.5 * float(self.k_tau @ dots(u, u))
+                energy += 0.5 * float((self.k_tau * dots(u, u)).sum())
         if self.rubs:
-            energy += float(self.friction @ (self._slid(x)[1] - self.creep))
+            energy += float((self.friction * (self._slid(x)[1] - self.creep)).sum())
         return energy
 
     def forces(self, x: np.ndarray) -> tuple[np.ndarray, float]:
@@ -169,7 +169,7 @@ class ContactEnergy:
             if self.sticks:
                 pull += self.k_tau[:, None] * self._slipped(C)
             _spread(self.weights, self.vertices, -pull, f)
-            scale += float(self.reach @ norms(pull))
+            scale += float((self.reach * norms(pull)).sum())
         if self.rubs:
             u, length = self._slid(x)
             rub = (self.friction / length)[:, None] * u

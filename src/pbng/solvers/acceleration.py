@@ -13,6 +13,7 @@ import numpy as np
 from numba import uint64
 
 from pbng.errors import InputError
+from pbng.jit import serial
 from pbng.parallel import array, body, each
 
 CHUNK = 4096  # entries a thread takes at a time; sums are formed chunk by chunk, so that their rounding is fixed
@@ -304,14 +305,42 @@ class MixingHistory:
 
     def _weights(self) -> np.ndarray | None:
         """θ of the least-squares problem, from its scaled normal equations with a tiny ridge; None if it has none."""
-        n = min(self.count, self.memory)
-        norms = np.sqrt(np.diag(self.gram)[:n])
-        used = norms > 1e-12 * norms.max()  # a difference lost in rounding has no direction
-        if not (np.isfinite(self.gram[:n, :n]).all() and np.isfinite(self.rhs[:n]).all() and used.any()):
-            return None
-        scale = np.where(used, 1 / np.where(used, norms, 1.0), 0.0)
-        A = self.gram[:n, :n] * scale[:, None] * scale + 1e-12 * n * np.eye(n)
-        return scale * np.linalg.lstsq(A, scale * self.rhs[:n], rcond=1e-12)[0]
+        theta = np.empty(min(self.count, self.memory))
+        return theta if _least_squares(self.gram, self.rhs, theta) else None
+
+
+@serial
+def _least_squares(gram, rhs, theta):
+    """Body of :meth:`MixingHistory._weights`: A = L D Lᵀ with no pivot below the ridge, which bounds them all."""
+    n = theta.size
+    for i in range(n):
+        for j in range(n):
+            if not (math.isfinite(gram[i, j]) and math.isfinite(rhs[i])):
+                return False
+    norms = np.sqrt(np.diag(gram)[:n])
+    largest, ridge = norms.max(), 1e-12 * n
+    if not largest > 0:
+        return False
+    # A difference lost in rounding has no direction.
+    scale = np.array([1 / norm if norm > 1e-12 * largest else 0.0 for norm in norms])
+    A, D = np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        theta[i] = scale[i] * rhs[i]
+        for j in range(i + 1):
+            A[i, j] = gram[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                A[i, j] -= A[i, k] * A[j, k] * D[k]
+            if j < i:
+                A[i, j] /= D[j]
+                theta[i] -= A[i, j] * theta[j]
+        D[i] = max(A[i, i] + ridge, ridge)
+    for i in range(n - 1, -1, -1):
+        theta[i] /= D[i]
+        for j in range(i + 1, n):
+            theta[i] -= A[j, i] * theta[j]
+    for i in range(n):
+        theta[i] *= scale[i]
+    return True
 
 
 @cache
