@@ -105,7 +105,7 @@ def armadillos(
     half = CLOTH / 2 + 0.4
     # Friction lets the bodies come to rest in the box.
     scene.collide_with(container((-half, -DEPTH, -half), (half, -1.5, half), friction=0.3, name="glass box"))
-    scene.contact()
+    scene.contact(self_collision=True)  # or limbs fold through their own bodies, and stay so
     frames = 1 + round(30 * (free_at + 3.0))
     return Recipe(scene, frames=frames, inertia=True, substeps=9, budget=Budget(iterations=40))
 
