@@ -253,7 +253,7 @@ def test_layouts_that_grow_are_as_good_as_new(monkeypatch):
     problem, x, contacts = in_contact(n=5)
     method = pbng.PBNG(dtype="float64").set_up(problem)
     monkeypatch.setattr("pbng.contact.nodes.ROOM", 2.0)  # a small scene has few blocks
-    rng, grown = np.random.default_rng(0), 0
+    rng, grown, blocks, before = np.random.default_rng(0), 0, None, 0
     among = rng.random(len(contacts.vertices)) < 0.6
     for _ in range(12):
         among ^= rng.random(len(among)) < 0.03
@@ -265,7 +265,10 @@ def test_layouts_that_grow_are_as_good_as_new(monkeypatch):
         method.start(found.put_outside(x), contacts=found)
         method.step()
         nodes = method.contact_nodes["float64"]
-        grown += len(nodes.blocks.color_start) - 1 > nodes.color.max() + 1  # some nodes have lanes behind the others
+        grown += blocks is nodes.blocks and before < len(nodes.owner)
+        blocks, before = nodes.blocks, len(nodes.owner)
+        assert (nodes.lane >= 0).sum() > len(nodes.node)  # neighbours have the lanes left over
+        assert (np.diff(blocks.color_start) > 0).all()
         moving = nodes.owner[nodes.place >= 0]
         assert np.array_equal(np.sort(moving), nodes.node)
         assert np.array_equal(nodes.place[nodes.place >= 0], 4 * method.packed.slot[moving])
@@ -279,6 +282,20 @@ def test_layouts_that_grow_are_as_good_as_new(monkeypatch):
     for _ in range(300):
         method.step()
     assert method.certify().residual < 1e-9 * first
+
+
+def test_what_is_not_a_number_passes():
+    problem, x, contacts = in_contact()
+    method = pbng.PBNG(dtype="float64").set_up(problem)
+    method.start(contacts.put_outside(x), contacts=contacts)
+    good, bad, again = method.x.copy(), method.x * 1e300, method.x.copy()
+    method.apply(bad)
+    assert not np.isfinite(bad).all()
+    method.apply(again)
+    for v in method.contact_nodes.values():
+        v.force[:] = 0
+    method.apply(good)
+    np.testing.assert_array_equal(again, good)
 
 
 def test_a_node_that_meets_many_colors_gets_a_free_one():

@@ -34,10 +34,10 @@ def nearest(x, plane, level):
     return None if np.linalg.norm(left) < 1e-8 else x - left[:3] / left[3]
 
 
-def moved(x, plane, level, held=None):
+def moved(x, plane, level, held=None, far=FAR):
     """One vertex in its half-spaces, which is what it was plus what pushes it, and the pushes."""
     y, none = np.array([x]), np.zeros(len(level), int)
-    pushed = HalfSpaces(none, plane).move_in(y, level, held)
+    pushed = HalfSpaces(none, plane).move_in(y, level, held, far)
     assert np.isfinite(y).all()
     np.testing.assert_allclose(y[0], x + pushed @ plane, atol=1e-11 * (1 + np.abs(pushed).max()))
     assert held is not None or pushed.min() >= 0
@@ -60,11 +60,12 @@ def test_a_vertex_moves_to_the_nearest_point_of_its_half_spaces(rng, name, level
     for _ in range(100):
         plane, x = turned(SETS[name](rng), rng), 2 * rng.normal(size=3)
         level = {"at random": rng.normal(size=len(plane)), "equal": rng.normal() * np.ones(len(plane))}.get(levels)
+        far = FAR
         if level is None:  # forces: what is left of them is in a cone
-            level = np.zeros(len(plane))
-        y, _ = moved(x, plane, level)
+            level, far = np.zeros(len(plane)), np.inf
+        y, _ = moved(x, plane, level, far=far)
         depth, wanted = (level - plane @ x).max(), nearest(x, plane, level)
-        if wanted is not None and np.linalg.norm(wanted - x) < 0.99 * FAR * max(depth, 0.0):
+        if wanted is not None and np.linalg.norm(wanted - x) < 0.99 * far * max(depth, 1e-300):
             np.testing.assert_allclose(y, wanted, atol=1e-7)
             near += 1
         elif depth <= 0:

@@ -32,7 +32,7 @@ class ContactReport:
         size: Diagonal of the bounding box of the scene at rest [m], to compare these with.
         vertices: Vertices in contact, ascending, (n,).
         recolored: Nodes that got another colour in the frame.
-        repacked: Nodes laid out anew in the frame.
+        repacked: Nodes laid out anew in the frame, in contact or beside those.
         detect_seconds, pack_seconds: Time [s] of the frame that finding contacts took, and colouring and packing.
         seconds: That of the whole frame [s].
     """

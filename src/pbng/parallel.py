@@ -4,8 +4,9 @@ Numba spends about as long on a parallel loop as on the code inside it. A *body*
 ``(arguments, low, high)`` that does the work of a range; the driver, compiled once and cached, calls it by its address.
 Arrays go as addresses too: :func:`array` and :func:`rows` make them arrays again inside the body.
 
-A body that is not made by :func:`pbng.dispatch.specialised` is cached by its own file alone: after a change of this
-file, of ``linalg`` or of ``spectral``, ``make clean`` removes what is stale.
+A body that is not made by :func:`pbng.dispatch.specialised`, and what is ``serial``, is cached by its own file alone:
+after a change of helpers in another file, as this one, ``linalg``, ``spectral`` or those of contact, ``make clean``
+removes what is stale.
 """
 
 import ctypes
@@ -27,7 +28,7 @@ _ENDLESS = 1 << 40  # lengths are not passed: bodies know how far they may go
 # In NumPy's C interface the address of the data follows the head of the object: read there it costs a seventh of asking
 # the array for it, and a small scene asks a thousand times a step.
 _HEAD, _word = object.__basicsize__, ctypes.c_ssize_t.from_address
-_ONE = np.zeros(1, np.int64)
+_ONLY_SET = np.zeros(1, np.int64)
 
 
 def run(body: Any, arrays: tuple[np.ndarray, ...], sets: np.ndarray, start: np.ndarray, grain: int = 1) -> None:
@@ -45,7 +46,7 @@ def run(body: Any, arrays: tuple[np.ndarray, ...], sets: np.ndarray, start: np.n
 
 def each(body: Any, arrays: tuple[np.ndarray, ...], n: int, grain: int = 1) -> None:
     """Call a body for the range 0 .. n, in parallel; as :func:`run`."""
-    run(body, arrays, _ONE, np.array([0, n]), grain)
+    run(body, arrays, _ONLY_SET, np.array([0, n]), grain)
 
 
 @cache

@@ -87,7 +87,7 @@ class Contacts:
 
     def height(self, x: np.ndarray) -> np.ndarray:
         """How far inside of each half-space its vertex is at x (n_vert, 3) [m], (k,)."""
-        return HalfSpaces(self.vertex, self.plane).height(x, self.level)
+        return dots(self.plane, x[self.vertex]) - self.level
 
     def put_outside(self, x: np.ndarray) -> np.ndarray:
         """A copy of x (n_vert, 3) with every vertex in its half-spaces."""
@@ -180,7 +180,7 @@ class ContactEnergy:
     def balance(self, f: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Take from forces f (n, 3) at x (n, 3), in place, what half-spaces that are touched bear, (k,) [N]."""
         # What is left is the part of a force along which its vertex could move: its projection onto a cone.
-        return self.walls.move_in(f, np.where(self.held(x, tolerance), 0.0, -np.inf))
+        return self.walls.move_in(f, np.where(self.held(x, tolerance), 0.0, -np.inf), far=np.inf)
 
     def put_outside(self, x: np.ndarray, held: np.ndarray | None = None) -> None:
         """Move x (n, 3), of any precision, into the half-spaces, in place; onto the planes of those ``held`` (k,)."""
@@ -238,8 +238,9 @@ class ContactEnergy:
         gap = np.maximum(self._gaps(x)[1], 0.0)
         f = np.zeros((self.n, 3))
         _spread(self.weights, self.vertices, -(active[:m] * self.k_n * gap)[:, None] * self.normal, f)
-        height = np.maximum(self.walls.height(x, self.level), 0.0)
-        np.add.at(f, self.vertex, -(active[m:] * bearing[self.vertex] * height)[:, None] * self.plane)
+        k = np.flatnonzero(active[m:])
+        height = np.maximum(self.walls.height(x, self.level)[k], 0.0)
+        np.subtract.at(f, self.vertex[k], (bearing[self.vertex[k]] * height)[:, None] * self.plane[k])
         return f
 
     def _gaps(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -111,7 +111,7 @@ class Detector:
         coefficient = np.repeat([c.friction for c in self.spec.colliders], [len(t.vertex) for t in touches])
         if borne is None or not coefficient.any():
             return np.zeros(len(vertex))
-        return coefficient * HalfSpaces(vertex, normal).move_in(-borne, np.zeros(len(vertex)))
+        return coefficient * HalfSpaces(vertex, normal).move_in(-borne, np.zeros(len(vertex)), far=np.inf)
 
     def _cut(self, x: np.ndarray, vertex: np.ndarray, normal: np.ndarray, level: np.ndarray) -> None:
         """Make half-spaces, in place, what vertices of plane bodies see: cut by their plane, in which they stay."""

@@ -26,7 +26,7 @@ class HalfSpaces:
 
     Args:
         vertex: Vertex of each, (k,).
-        plane: Its unit normal, (k, 3), or zero if nothing can be done about it; then its level has to be -inf.
+        plane: Its unit normal, (k, 3), or zero if nothing can be done about it; its level is then not positive.
     """
 
     def __init__(self, vertex: np.ndarray, plane: np.ndarray) -> None:
@@ -43,20 +43,21 @@ class HalfSpaces:
         _measure(x, self.vertex, self.plane, level, height)
         return height
 
-    def move_in(self, x: np.ndarray, level: np.ndarray, held: np.ndarray | None = None) -> np.ndarray:
+    def move_in(self, x: np.ndarray, level: np.ndarray, held: np.ndarray | None = None, far: float = FAR) -> np.ndarray:
         """Move each vertex to the nearest point of its half-spaces, in place.
 
         Args:
             x: Positions (n, 3) [m], of any precision.
             level: What n·x must not be less than [m], (k,); -inf leaves a half-space out.
             held: Of which half-spaces (k,) the vertex is moved onto the plane, whichever side it is on.
+            far: How far a vertex goes at most, in multiples of the depth that it is at; if farther, only part of it.
 
         Returns:
             How far each half-space has pushed its vertex [m], (k,): x is what it was plus Σ pushed n.
         """
         pushed = np.zeros(len(level))
         both = np.zeros(len(level), bool) if held is None else held
-        _move_in(x, self.owner, self.first, self.order, self.plane, level, both, pushed)
+        _move_in(x, self.owner, self.first, self.order, self.plane, level, both, far, pushed)
         return pushed
 
 
@@ -73,7 +74,7 @@ def _measure(x, vertex, plane, level, height):
 
 
 @serial
-def _move_in(x, owner, first, order, plane, level, held, pushed):
+def _move_in(x, owner, first, order, plane, level, held, far, pushed):
     for g in range(owner.size):
         v, low, high = owner[g], first[g], first[g + 1]
         y = _double(x, v)
@@ -86,7 +87,7 @@ def _move_in(x, owner, first, order, plane, level, held, pushed):
                 size = max(size, abs(level[i]))
         if depth > 0.0:
             slack = EXACT * depth + ROUNDING * size
-            x[v, 0], x[v, 1], x[v, 2] = _nearest(y, order[low:high], plane, level, held, slack, FAR * depth, pushed)
+            x[v, 0], x[v, 1], x[v, 2] = _nearest(y, order[low:high], plane, level, held, slack, far * depth, pushed)
 
 
 @serial

@@ -109,9 +109,9 @@ class Insides:
         if own:
             asked[found[behind]] = True
         else:
-            k = np.flatnonzero(behind & far)
-            sure[k] &= (weights[found[k]] > 0).all(1)
-            asked[found] = self.solid[body] & ~sure
+            sure &= ~(behind & far)
+            asked[found[sure & self.solid[body]]] = False
+            asked[found[~sure & self.solid[body]]] = True
             solid[found[behind & sure]] = body[behind & sure]
         q = np.flatnonzero(asked)
         if len(q):

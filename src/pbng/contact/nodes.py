@@ -46,8 +46,9 @@ _1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11 = (uint64(W * j) for j in range(1, 
 class ContactNodes:
     """Layout and sweep of the nodes in contact of a packed problem.
 
-    Nodes that come into contact are laid out in blocks behind those that are there, and the lanes of nodes that leave,
-    or get another colour, are passed over. When there is no room left all are laid out anew.
+    Nodes that come into contact are laid out in blocks behind those that are there, with neighbours of theirs in lanes
+    that would be left over; the lanes of nodes that are not in contact, or got another colour, are passed over. When
+    there is no room left all are laid out anew.
 
     Args:
         problem: What is solved.
@@ -60,7 +61,7 @@ class ContactNodes:
         self.neighbours = _neighbours(problem, problem.contact.surface)
         self.color = problem.color.copy()  # of nodes that have a lane perhaps another
         self.contacts: Contacts | None = None  # of this step
-        self.node = np.empty(0, np.int64)  # in contact, in order of the problem
+        self.node = np.empty(0, np.int64)  # in contact, ascending
         self.recolored = self.repacked = 0  # nodes so far
         self.seconds = 0.0  # that all this took
         self.others = replace(packed, nodal=packed.nodal.copy())  # what is swept of the rest
@@ -209,7 +210,8 @@ class Blocks:
             a[first:last] = more
         self.seg_start = np.concatenate([self.seg_start, len(self.seg) + rows.seg_start[1:]])
         self.seg = np.concatenate([self.seg, rows.seg + np.array([0, 0, 0, *self.used[:2]])])
-        self.color_start = np.concatenate([self.color_start, self.color_start[-1] + color_start[1:]])
+        more = self.color_start[-1] + np.unique(color_start)  # a set of no blocks would cost as much as a small one
+        self.color_start = np.concatenate([self.color_start, more[1:]])
         self.used = end
         return True
 
@@ -361,11 +363,13 @@ def _step(at, x, acc, l, omega, creep, settled, low, high, other, row, force):
     d0, d1, d2 = omega * d0, omega * d1, omega * d2
     for c in range(low, high):
         w, p = row[c, 0], force[c]
-        if p > real(0):
+        if real(0) < p < real(np.inf):
             y0, y1, y2 = solve_spd(a0, a1, a2, a3, a4, a5, w * row[c, 5], w * row[c, 6], w * row[c, 7])
             d0 += p * y0
             d1 += p * y1
             d2 += p * y2
+        else:  # what is not a number is forgotten
+            force[c] = real(0)
     for _ in range(ROUNDS if high - low > 1 else 1):
         largest, most = real(0), real(0)
         for c in range(low, high):

@@ -77,7 +77,7 @@ def _behind(arguments, low, high):
         n, sure[k] = point(areas, t), True
         corners = (1 if u > 0.0 else 0) + (1 if v > 0.0 else 0) + (1 if w > 0.0 else 0)
         if corners == 2:
-            e = edge[3 * t + (0 if w == 0.0 else (1 if u == 0.0 else 2))]
+            e = edge[3 * t + (0 if not w > 0.0 else (1 if not u > 0.0 else 2))]
             n = 0.0, 0.0, 0.0
             for i in range(start[e], start[e + 1]):
                 n = add(n, unit(point(areas, beside[i])))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 NEAR = 0.5  # at which distance surfaces count as close, in mean lengths of their edges
-CLOSE = 0.1  # the same in a step of a motion, to which twice what the step is expected to move is added
+CLOSE = 0.1  # the same in a step of a motion, to which comes what the step is expected to move
 
 
 @dataclass(frozen=True, eq=False)

@@ -245,3 +245,9 @@ class History:
         self.energies.append(certificate.energy)
         self.monitored.append(iteration)
         self.last = certificate
+
+    def drop(self, iteration: int) -> None:
+        """Forget the last values if they are of this iteration."""
+        if self.monitored[-1:] == [iteration]:
+            for values in (self.residuals, self.energies, self.monitored):
+                values.pop()

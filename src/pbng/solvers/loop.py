@@ -50,7 +50,7 @@ def run(
     except KeyboardInterrupt:
         solve.status = Status.INTERRUPTED
         if solve.iteration == 0:
-            method.start(x, targets, contacts)  # of which the certificate is
+            method.start(x, targets, contacts, resume=True)  # of which the certificate is
     return solve.result()
 
 
@@ -113,7 +113,9 @@ class _Solve:
     def result(self) -> Result:
         """The last state and its certificate."""
         history = self.history
-        if history.monitored[-1] != self.iteration:
+        if self.status is Status.INTERRUPTED and self.iteration:
+            history.drop(self.iteration)  # the state may be that of half an iteration more
+        if history.monitored[-1:] != [self.iteration]:
             self._certify()
             if self.status in (Status.ITERATIONS, Status.SECONDS):
                 self.status = self._verdict() or self.status
