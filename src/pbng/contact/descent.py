@@ -27,16 +27,19 @@ def gap2(boxes, i, low, high):
 
 @inline
 def lower_corner(a, b):
+    """Lowest corner of the box about points a and b."""
     return min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2])
 
 
 @inline
 def upper_corner(a, b):
+    """Highest corner of the box about points a and b."""
     return max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2])
 
 
 @inline
 def squared(a):
+    """a², of what is worth naming only once."""
     return a * a
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pbng.contact.bvh import BoxTree
+from pbng.contact.collider import norms
 from pbng.contact.contacts import Contacts
 from pbng.contact.inside import Insides
 from pbng.contact.normals import SHARP, SmoothNormals
@@ -23,7 +24,6 @@ from pbng.contact.spec import CLOSE, NEAR, Surfaces
 from pbng.errors import InputError
 from pbng.jit import inline
 from pbng.linalg import add, combine, cross, dot, point, scale, sub, unit
-from pbng.mesh import triangle_areas
 from pbng.parallel import array, body, each, rows
 from pbng.topology import edge_sides
 
@@ -56,7 +56,7 @@ class SurfaceDetector:
         tell = Sides(self.normals, start, sides)
         self.insides = Insides(s, X, self.vertex, self.body, self.triangles, self.normals, tell)
         self.solid = self.insides.solid
-        self.edges, self.beside = self._sharp_edges(X, edges, start, sides)
+        self.edges, self.beside = self._sharp_edges(edges, start, sides)
         self.edge_ends = np.ascontiguousarray(self.edges.T)
         self.edge_body = self.body[self.edge_ends[0]]
         self.edge_tree = BoxTree(X, self.edges, self.edge_body)
@@ -90,16 +90,14 @@ class SurfaceDetector:
                 f" {s.rings} rings away; use a smaller thickness, or more rings"
             )
 
-    def _sharp_edges(
-        self, X: np.ndarray, edges: np.ndarray, start: np.ndarray, sides: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _sharp_edges(self, edges: np.ndarray, start: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Edges that may touch edges, (k, 2), and the two triangles at each.
 
         Of solids those that are sharp at rest: elsewhere vertices find all there is, and which of many crossing edges
         is closest changes with every movement. Of cloth all, as it folds anywhere.
         """
         beside = np.column_stack([sides[start[:-1]], sides[start[1:] - 1]]) // 3  # twice the same where there is one
-        a, b = (triangle_areas(X, self.surfaces.triangles[t]) for t in beside.T)
+        a, b = (self.normals.areas[t] for t in beside.T)  # which are fitted to the rest state as yet
         cosine = (a * b).sum(1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
         used = (cosine < SHARP) | ~self.solid[self.body[edges[:, 0]]]
         return edges[used], beside[used].astype(np.int32)
@@ -116,8 +114,7 @@ class SurfaceDetector:
         """
         s = self.surfaces
         x0 = np.ascontiguousarray(x0, float)
-        step = x1 - x0
-        moved = np.sqrt(np.einsum("vi,vi->v", step, step))  # a norm along an axis takes four times as long
+        moved = norms(x1 - x0)
         radius = self.radius + min(ahead, AHEAD * self.radius)
         if dt is not None and s.radius is None:
             radius, moved = CLOSE / NEAR * self.radius, FARTHER * moved
