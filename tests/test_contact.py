@@ -146,6 +146,8 @@ def test_closing_forces_are_at_rest_where_gaps_are_closed():
         f = free.closing(x, active, bearing)
         assert np.abs(f).max() > 0
         np.testing.assert_allclose((H @ d.ravel()).reshape(-1, 3), f, atol=1e-9 * np.abs(f).max())
+    nowhere = replace(contacts, plane=0 * contacts.plane, level=np.full(len(contacts.level), -np.inf))
+    assert np.isfinite(energy_of(nowhere, problem).closing(x, np.arange(len(active)) < m, bearing)).all()
     closed = np.concatenate([gap < 0, np.zeros(len(contacts.vertex), bool)])
     assert closed.any()
     assert (energy.closing(x, closed, bearing) == 0).all()

@@ -8,6 +8,7 @@ from pbng.contact.bvh import BoxTree
 from pbng.contact.detection import Detector
 from pbng.contact.queries import closest_triangles, containing_tets
 
+CLOTH = pbng.Membrane(E=100.0, nu=0.3, density=0.1)
 SOFT = pbng.Corotated(E=1e3, nu=0.3, density=10.0)
 
 
@@ -15,6 +16,8 @@ def inside(problem, x):
     """Of each vertex, whether a tet of another body contains it, None where it is at its surface."""
     out = np.zeros(problem.n_vert, object)
     for b in problem.bodies:
+        if b.mesh.cells.shape[1] < 4:
+            continue
         others = np.r_[: b.start, b.stop : problem.n_vert]
         found, _ = containing_tets(BoxTree(x, b.start + b.mesh.cells), x, x[others])
         *_, distance = closest_triangles(BoxTree(x, b.start + b.mesh.surface), x, x[others])
@@ -25,26 +28,31 @@ def inside(problem, x):
 
 @pytest.mark.parametrize("speed", [0.0, 1.0, 30.0])
 def test_vertices_know_what_they_are_inside_of(rng, speed):
-    """A ball goes through a box, both shaken, and some vertices fast: step by step each is inside where tets say so."""
+    """A ball goes through a box, both shaken, and some vertices fast: step by step each is inside where tets say so.
+
+    A sheet in the box, along the way, is closest to what is deep inside.
+    """
     scene = pbng.Scene()
     scene.add(pbng.shapes.box((1.0, 0.7, 1.0), 5), SOFT, name="box")
     ball = scene.add(pbng.shapes.sphere(0.35, 5), SOFT, name="ball", at=(0.4, 1.2, 0.55))
+    sheet = scene.add(pbng.shapes.sheet((0.5, 0.5), 6, origin=(0.25, 0.3, 0.25)), CLOTH, name="sheet")
     scene.contact()
     problem = scene.compile(free=True)
     shaken = problem.X + 0.01 * rng.normal(size=problem.X.shape)
     detector = Detector(problem.contact, problem.X, problem.fixed)
     surface, ins = detector.surfaces.vertex, detector.surfaces.insides
+    one_solid = surface < sheet.start  # the sheet comes to lie in both
     most = 0
     for step in range(40):
         x = shaken + 0.001 * rng.normal(size=shaken.shape)
-        x[ball.start :, 1] -= 0.03 * step
+        x[ball.start : sheet.start, 1] -= 0.03 * step
         ahead = x + 0.01 * speed * rng.normal(size=x.shape) * (rng.random(len(x)) < 0.2)[:, None]
-        ahead[ball.start :, 1] -= 0.03
+        ahead[ball.start : sheet.start, 1] -= 0.03
         detector.find(x, ahead, 0.01 * step, 0.01 * (step + 1), dt=0.01)
         wanted = inside(problem, x)[surface]
-        sure = wanted != None  # noqa: E711 (element by element)
+        sure = one_solid & (wanted != None)  # noqa: E711 (element by element)
         np.testing.assert_array_equal(ins.were_inside[0][sure], wanted[sure].astype(bool))
-        most = max(most, int(ins.were_inside[0].sum()))
+        most = max(most, int(ins.were_inside[0][one_solid].sum()))
     assert most > 20
 
 

@@ -196,21 +196,26 @@ def test_interrupt_keeps_the_state(bar, dtype):
     assert result.residual == whole.residual
 
 
-def test_interrupt_within_a_step_keeps_the_state(bar):
-    """Ctrl-C between sweeps of a step: the state is finite, and its certificate is its own."""
-    method = DOUBLE.set_up(bar)
+@pytest.mark.parametrize("acceleration", [pbng.Anderson, None])
+@pytest.mark.parametrize("swept", [False, True])
+def test_interrupt_within_a_step_keeps_the_state(bar, acceleration, swept):
+    """Ctrl-C before or after the sweep of a step: the state is finite, and its certificate is its own."""
+    method = pbng.PBNG(acceleration, dtype="float64").set_up(bar)
     step, count = method.step, itertools.count()
 
     def interrupted():
-        if next(count) == 3:
+        last = next(count) == 3
+        if swept or not last:
+            step()
+        if last:
             raise KeyboardInterrupt
-        step()
 
     method.step = interrupted
-    result = run(method, start_of(bar), pbng.Budget(rtol=1e-9))
+    result = run(method, start_of(bar), pbng.Budget(rtol=1e-9, every=1))
     assert result.status is pbng.Status.INTERRUPTED
     assert result.iterations == 3
     assert result.residual == pytest.approx(bar.residual(result.x), rel=1e-9)
+    np.testing.assert_array_equal(result.monitored, [0, 1, 2, 3])
 
 
 def test_monitor_is_told_what_the_result_says(bar):
