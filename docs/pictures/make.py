@@ -33,7 +33,7 @@ def dragon() -> None:
 
 def falling() -> None:
     """Soft bodies that fall into a glass box."""
-    pbng.view.sheet(frames("dropping_shapes", 76), HERE / "falling.png", color="body")
+    pbng.view.sheet(frames("dropping_shapes", 76), HERE / "falling.png", color="body", width=1280)
 
 
 if __name__ == "__main__":
