@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import pbng
 from pbng.contact.bvh import BoxTree
 from pbng.contact.queries import closest_edges, closest_triangles, containing_tets
-from pbng.contact.rings import neighbourhoods
+from pbng.contact.rings import neighbourhoods, spans
 
 ball = pbng.shapes.sphere(radius=1.0, vertices=9)
 
@@ -165,7 +165,9 @@ def test_excluded_triangles_are_not_found():
     tree = BoxTree(X, surface)
     for rings in (0, 1, 2):
         start, ids = neighbourhoods(surface, len(X), rings)
-        found, _, distance = closest_triangles(tree, X, X[vertex], vertex=vertex, excluded=(start, ids))
+        found, _, distance = closest_triangles(
+            tree, X, X[vertex], vertex=vertex, excluded=spans(tree.order, start, ids)
+        )
         every = distances(X, surface, X[vertex])
         for k, v in enumerate(vertex):
             every[k, ids[start[v] : start[v + 1]]] = np.inf
@@ -185,6 +187,14 @@ def test_neighbourhoods(rings):
             cells = set(np.flatnonzero(np.isin(surface, list(vertices)).any(1)))
             vertices |= set(surface[sorted(cells)].ravel())
         assert ids[start[v] : start[v + 1]].tolist() == sorted(cells)
+
+
+def test_spans(rng):
+    """Places are joined that follow each other, and those of no two vertices."""
+    start, ids = np.array([0, 3, 3, 5, 6]), np.array([0, 1, 3, 2, 3, 0])
+    found = spans(np.array([3, 1, 0, 2]), start, ids)  # places: of 0 the third, of 1 the second, of 2 the last ...
+    assert found.start.tolist() == [0, 1, 1, 3, 4]
+    assert list(zip(found.low.tolist(), found.high.tolist())) == [(0, 3), (0, 1), (3, 4), (2, 3)]
 
 
 def test_triangles_that_a_point_is_behind(rng):
@@ -256,7 +266,7 @@ def test_closest_edges_leave_out_neighbours_and_groups(rng):
     edges = pbng.topology.unique_edges(ball.surface, pbng.topology.TRIANGLE_EDGES)
     tree = BoxTree(X, edges)
     start, ids = neighbourhoods(edges, len(X), 2)
-    found, *_ = closest_edges(tree, X, edges, excluded=(start, ids))
+    found, *_ = closest_edges(tree, X, edges, excluded=spans(tree.order, start, ids))
     for e, f in zip(edges, found):
         assert not np.isin(f, np.concatenate([ids[start[v] : start[v + 1]] for v in e]))
     found, *_ = closest_edges(tree, X, edges)
@@ -317,28 +327,30 @@ def test_containing_tets_leave_out_those_of_the_vertex(rng):
     np.testing.assert_array_equal(found >= 0, inside)
     assert (group[found[inside]] != body[inside]).all()
     assert (containing_tets(tree, x, x, np.arange(len(x)), own=body, meets=np.eye(2, dtype=bool))[0] == -1).all()
-    lists = neighbourhoods(cells, len(x), 1)
+    lists = spans(tree.order, *neighbourhoods(cells, len(x), 1))
     others = containing_tets(tree, x, x, np.arange(len(x)), excluded=lists)
     np.testing.assert_array_equal(others[0], found)
 
 
-@pytest.mark.parametrize("rings", [2, 8])  # lists short enough to be noted, and longer ones
+@pytest.mark.parametrize("rings", [2, 8])
 def test_long_lists_of_what_is_left_out(rings):
     x, triangles = ball.X, ball.surface
     edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0).astype(np.int32)
     v = np.unique(triangles)
-    start, ids = near = neighbourhoods(triangles, len(x), rings)
-    found, _, distance = closest_triangles(BoxTree(x, triangles), x, x[v], 1.5, vertex=v, excluded=near)
+    start, ids = neighbourhoods(triangles, len(x), rings)
+    tree = BoxTree(x, triangles)
+    left_out = spans(tree.order, start, ids)
+    found, _, distance = closest_triangles(tree, x, x[v], 1.5, vertex=v, excluded=left_out)
     every = distances(x, triangles, x[v])
     for k, w in enumerate(v):
         every[k, ids[start[w] : start[w + 1]]] = np.inf
     lowest = (every <= every.min(1, keepdims=True) + 1e-13).argmax(1)
     np.testing.assert_array_equal(found, np.where(every.min(1) <= 1.5, lowest, -1))
     np.testing.assert_allclose(distance, np.where(every.min(1) <= 1.5, every.min(1), np.inf), atol=1e-12)
-    start, ids = near = neighbourhoods(edges, len(x), rings)
+    start, ids = neighbourhoods(edges, len(x), rings)
     assert (np.diff(start).max() > 200) == (rings > 2)
     tree = BoxTree(x, edges)
-    found, _, _, distance = closest_edges(tree, x, edges, 1.5, excluded=near)
+    found, _, _, distance = closest_edges(tree, x, edges, 1.5, excluded=spans(tree.order, start, ids))
     for k in range(0, len(edges), 7):
         out = np.concatenate([ids[start[w] : start[w + 1]] for w in edges[k]])
         rest = np.setdiff1d(np.arange(len(edges)), out)
@@ -430,7 +442,7 @@ def test_what_does_not_fit_is_refused(rng):
     """Bodies read without looking: nothing out of range may come to them."""
     x, triangles = soup(rng, 20)
     tree, p, k = BoxTree(x, triangles, np.arange(20) % 3), rng.random((5, 3)), np.arange(5)
-    lists = neighbourhoods(triangles, len(x), 1)
+    lists = spans(tree.order, *neighbourhoods(triangles, len(x), 1))
     everything = np.ones((3, 3), bool)
     for wrong in (
         lambda: tree.refit(x[:-1]),

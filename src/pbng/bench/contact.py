@@ -10,7 +10,7 @@ import numpy as np
 from pbng.bench.timing import interleaved
 from pbng.contact.bvh import BoxTree
 from pbng.contact.queries import closest_edges, closest_triangles, containing_tets
-from pbng.contact.rings import neighbourhoods
+from pbng.contact.rings import neighbourhoods, spans
 from pbng.shapes import sphere
 from pbng.solvers.threads import check_threads
 from pbng.topology import TRIANGLE_EDGES, unique_edges
@@ -74,7 +74,8 @@ def _triangles(x: np.ndarray, triangles: np.ndarray, p: np.ndarray, rounds: int)
 def _edges(x: np.ndarray, edges: np.ndarray, around: tuple[np.ndarray, np.ndarray], rounds: int) -> Row:
     """All edges of a body against all, those within two rings left out."""
     tree = BoxTree(x, edges)
-    contestants = {"cut": lambda: closest_edges(tree, x, edges, CUT, excluded=around)}
+    left_out = spans(tree.order, *around)
+    contestants = {"cut": lambda: closest_edges(tree, x, edges, CUT, excluded=left_out)}
     return _row("closest edge", tree, x, edges, len(edges), contestants, rounds)
 
 

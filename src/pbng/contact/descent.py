@@ -11,8 +11,8 @@ from pbng.contact.bvh import DEPTH
 from pbng.jit import inline
 
 STARTS = 48  # nodes from which these go on by themselves, at most
+CORNERS = 6 * STARTS
 STACK = DEPTH + STARTS  # nodes that wait their turn
-SLOTS = 256  # for the primitives that one query leaves out; where they would fill more than half, they are looked up
 ROUNDING = 1e-14  # distances that differ by less, relative to themselves or to the size of the tree, are the same
 
 
@@ -58,34 +58,20 @@ def same_as(d2, slack):
 
 
 @inline
-def is_listed(start, ids, v, t):
-    """Whether t is among the numbers of v."""
-    low, high = start[v], start[v + 1]
-    while low < high:
-        middle = (low + high) >> 1
-        if ids[middle] < t:
-            low = middle + 1
-        else:
-            high = middle
-    return low < start[v + 1] and ids[low] == t
+def seek(start, high, v, e):
+    """The first of the spans of v, sorted and apart, that does not end before place e, or the first of the next."""
+    e, before = np.int32(e), np.int32(0)
+    for r in range(start[v], start[v + 1]):
+        before += np.int32(high[r] <= e)
+    return start[v] + before
 
 
 @inline
-def note(noted, query, t):
-    """Note that a query, numbered from 1, leaves out t: in the next free slot, as a table of hashes does."""
-    i = (t * 40503) & (SLOTS - 1)
-    while noted[i] >> 32 == query:
-        i = (i + 1) & (SLOTS - 1)
-    noted[i] = query << 32 | t
-
-
-@inline
-def is_noted(noted, query, t):
-    """Whether the query leaves out t."""
-    i = (t * 40503) & (SLOTS - 1)
-    while noted[i] >> 32 == query and noted[i] != query << 32 | t:
-        i = (i + 1) & (SLOTS - 1)
-    return noted[i] >> 32 == query
+def go_on(low, high, r, end, e):
+    """The first of spans r .. end that does not end before place e, which follows the last, and whether e is in it."""
+    if r < end and high[r] <= e:
+        r += 1
+    return r, r < end and low[r] <= e
 
 
 @inline
@@ -100,14 +86,12 @@ def common_ground(reach, own, n_group, grouped, first, last):
 
 
 @inline
-def find_starts(nodes, boxes, meets, row, low, high, reach, starts, stack):
+def find_starts(nodes, boxes, meets, row, low, high, reach, starts, corners, stack):
     """Nodes with all that is no farther than ``reach`` from a box, and how many; a row of -1 is that of many groups.
 
-    Without a bound there is only the root: from there near nodes come first.
+    Without a bound there is only the root: from there near nodes come first. ``corners`` are those of their boxes, one
+    coordinate after the other.
     """
-    if reach == np.inf:
-        starts[0] = 0
-        return 1
     within = reach * reach
     n, top = 0, 1
     stack[0] = 0
@@ -117,8 +101,10 @@ def find_starts(nodes, boxes, meets, row, low, high, reach, starts, stack):
         if gap2(boxes, i, low, high) > within or (row >= 0 and nodes[i, 3] >= 0 and not meets[row + nodes[i, 3]]):
             continue
         child = nodes[i, 0]
-        if child < 0 or n + top + 2 > STARTS:
+        if child < 0 or n + top + 2 > STARTS or reach == np.inf:
             starts[n] = i
+            for j in range(6):
+                corners[j * STARTS + n] = boxes[i, j]
             n += 1
         else:
             stack[top], stack[top + 1] = child + 1, child
@@ -127,19 +113,44 @@ def find_starts(nodes, boxes, meets, row, low, high, reach, starts, stack):
 
 
 @inline
-def begin(boxes, starts, n, low, high, within, stack, gaps):
-    """Put those starts on the stack that are no farther than √within from a box, near ones on top; how many."""
+def begin(starts, corners, n, low, high, within, stack, gaps):
+    """Put those starts on the stack that are no farther than √within from a box; how many."""
+    for s in range(n):
+        dx = max(corners[s] - high[0], 0.0, low[0] - corners[3 * STARTS + s])
+        dy = max(corners[STARTS + s] - high[1], 0.0, low[1] - corners[4 * STARTS + s])
+        dz = max(corners[2 * STARTS + s] - high[2], 0.0, low[2] - corners[5 * STARTS + s])
+        gaps[s] = dx * dx + dy * dy + dz * dz
     top = 0
     for s in range(n):
-        gap = gap2(boxes, starts[s], low, high)
-        if gap <= within:
-            j = top
-            while j > 0 and gaps[j - 1] < gap:
-                stack[j], gaps[j] = stack[j - 1], gaps[j - 1]
-                j -= 1
-            stack[j], gaps[j] = starts[s], gap
-            top += 1
+        gap = gaps[s]
+        stack[top], gaps[top] = starts[s], gap
+        top += 1 if gap <= within else 0
     return top
+
+
+@inline
+def leave_out(nodes, start, first, past, v, stack, gaps, top):
+    """Take starts off the stack that lie wholly in one of the spans of v; how many are left."""
+    r, end, left = start[v], start[v + 1], 0
+    for s in range(top):  # which are in the order of the tree, as spans are
+        i, gap = stack[s], gaps[s]
+        while r < end and past[r] <= nodes[i, 1]:
+            r += 1
+        if not (r < end and first[r] <= nodes[i, 1] and past[r] >= nodes[i, 2]):
+            stack[left], gaps[left] = i, gap
+            left += 1
+    return left
+
+
+@inline
+def put_nearest_on_top(stack, gaps, top):
+    """Of what is on the stack."""
+    nearest = 0
+    for s in range(1, top):
+        nearest = s if gaps[s] < gaps[nearest] else nearest
+    if top > 0:
+        stack[top - 1], stack[nearest] = stack[nearest], stack[top - 1]
+        gaps[top - 1], gaps[nearest] = gaps[nearest], gaps[top - 1]
 
 
 @inline

@@ -6,8 +6,8 @@ import numpy as np
 
 from pbng.contact.bvh import BoxTree
 from pbng.contact.normals import SmoothNormals
-from pbng.contact.queries import Excluded, closest_triangles, containing_tets
-from pbng.contact.rings import neighbourhoods
+from pbng.contact.queries import closest_triangles, containing_tets
+from pbng.contact.rings import Spans, neighbourhoods, spans
 from pbng.contact.sides import Sides
 from pbng.contact.spec import CLOSE, Surfaces
 
@@ -44,7 +44,9 @@ class Insides:
         self.solid[np.unique(s.tet_body)] = True
         self.each_alone = np.eye(len(s.names), dtype=bool)
         self.tets = BoxTree(X, s.tets, s.tet_body) if len(s.tets) else None
-        self.near_tets = neighbourhoods(s.tets, len(X), s.rings) if s.own.any() else None
+        self.near_tets = None
+        if self.tets and s.own.any():
+            self.near_tets = spans(self.tets.order, *neighbourhoods(s.tets, len(X), s.rings))
         self.forget()
 
     def forget(self) -> None:
@@ -63,7 +65,7 @@ class Insides:
         closest: tuple[np.ndarray, np.ndarray, np.ndarray],
         reach: np.ndarray,
         meets: np.ndarray,
-        excluded: Excluded | None,
+        excluded: Spans | None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What each vertex touches, if anything.
 
@@ -132,7 +134,7 @@ class Insides:
         solid: np.ndarray,
         near: tuple[np.ndarray, np.ndarray, np.ndarray],
         known: np.ndarray,
-        excluded: Excluded | None,
+        excluded: Spans | None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """By which triangle vertices leave the solids that they are inside of, (k,), and weights of the closest points.
 

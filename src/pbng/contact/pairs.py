@@ -16,9 +16,9 @@ from pbng.contact.collider import norms
 from pbng.contact.contacts import Contacts
 from pbng.contact.inside import Insides
 from pbng.contact.normals import SHARP, SmoothNormals
-from pbng.contact.queries import Excluded, closest_edges, closest_triangles
+from pbng.contact.queries import closest_edges, closest_triangles
 from pbng.contact.resistance import Pairs, resist
-from pbng.contact.rings import neighbourhoods
+from pbng.contact.rings import Spans, neighbourhoods, spans
 from pbng.contact.sides import Sides
 from pbng.contact.spec import CLOSE, NEAR, Surfaces
 from pbng.errors import InputError
@@ -67,7 +67,7 @@ class SurfaceDetector:
         self.several, self.any_own = bool(self.meets_others.any()), bool(s.own.any())
         if self.any_own:
             self.near_triangles, self.near_edges = (
-                neighbourhoods(c, len(X), s.rings) for c in (s.triangles, self.edges)
+                spans(t.order, *neighbourhoods(t.cells, len(X), s.rings)) for t in (self.triangles, self.edge_tree)
             )
         self.radius = s.radius if s.radius is not None else NEAR * float(s.spacing[present].mean())
         if self.any_own:
@@ -140,7 +140,7 @@ class SurfaceDetector:
             found = found.some(~self.fixed[found.vertices].all(1))
         return resist(found, x0, self.body, s, self.radius, dt, hold, k_tau)
 
-    def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Excluded | None) -> Pairs:
+    def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Spans | None) -> Pairs:
         vertex, reach = self.vertex, reach[self.vertex]
         asked: dict[str, Any] = {"own": self.insides.own, "meets": meets, "vertex": vertex, "excluded": excluded}
         closest = closest_triangles(self.triangles, x, x[vertex], reach, **asked)
@@ -153,7 +153,7 @@ class SurfaceDetector:
         np.negative(weights, w[:, 1:])
         return Pairs(stencil, w, self.normals.at(triangle, weights), inside[found])
 
-    def _edge_edge(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Excluded | None) -> Pairs:
+    def _edge_edge(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Spans | None) -> Pairs:
         asked: dict[str, Any] = {"own": self.edge_body, "meets": meets, "excluded": excluded}
         other, s, t, _ = closest_edges(self.edge_tree, x, self.edges, reach, **asked)
         mine = np.flatnonzero(other >= 0)

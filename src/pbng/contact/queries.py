@@ -4,9 +4,8 @@ What a query may find is restricted by keywords, all optional, which mean the sa
 
 ``own`` (k,) the group of each query, and ``meets`` (groups of queries, groups of the tree) bool, which of them look at
 which: ``~numpy.eye(n, dtype=bool)`` for contact with others, ``numpy.eye(n, dtype=bool)`` with oneself; a row of False
-is not asked, a column of False is never found. ``excluded`` = (start, ids): for each vertex the sorted numbers of
-primitives that it never finds, as :func:`pbng.contact.rings.neighbourhoods` gives them; ``vertex`` (k,) tells which
-vertex a point is.
+is not asked, a column of False is never found. ``excluded`` says which primitives each vertex never finds, as
+:func:`pbng.contact.rings.spans` gives them; ``vertex`` (k,) tells which vertex a point is.
 
 Results are the same for any number of threads. Of primitives at the same distance, up to rounding, the lowest is found.
 """
@@ -17,30 +16,31 @@ import numpy as np
 
 from pbng.contact.bvh import DEPTH, BoxTree
 from pbng.contact.descent import (
-    SLOTS,
+    CORNERS,
     STACK,
     STARTS,
     begin,
     common_ground,
     find_starts,
-    is_listed,
-    is_noted,
+    go_on,
+    leave_out,
     lower_corner,
     next_leaf,
-    note,
+    put_nearest_on_top,
     same_as,
+    seek,
     slack_of,
     squared,
     upper_corner,
 )
 from pbng.contact.primitives import closest_on_triangle, closest_segments, tet_weights
+from pbng.contact.rings import Spans
 from pbng.linalg import cross, dot, point, sub
 from pbng.parallel import array, body, each, rows, scratch
 
 GRAIN = 128  # queries that a thread takes at a time
 BUNCH = 8  # queries in a row, which are best near each other, that begin their ways down the tree together
 NONE = 1 << 31  # above every number
-Excluded = tuple[np.ndarray, np.ndarray]
 
 
 def closest_triangles(
@@ -52,7 +52,7 @@ def closest_triangles(
     own: np.ndarray | None = None,
     meets: np.ndarray | None = None,
     vertex: np.ndarray | None = None,
-    excluded: Excluded | None = None,
+    excluded: Spans | None = None,
     behind: bool = False,
     against: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -91,7 +91,7 @@ def closest_edges(
     *,
     own: np.ndarray | None = None,
     meets: np.ndarray | None = None,
-    excluded: Excluded | None = None,
+    excluded: Spans | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The edge of a tree closest to each edge, among those that share no vertex with it.
 
@@ -125,7 +125,7 @@ def containing_tets(
     *,
     own: np.ndarray | None = None,
     meets: np.ndarray | None = None,
-    excluded: Excluded | None = None,
+    excluded: Spans | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The tet of a tree that contains each point, of several the lowest; inverted tets contain points too.
 
@@ -159,9 +159,9 @@ def _common(
     own: np.ndarray | None,
     meets: np.ndarray | None,
     vertex: np.ndarray | None,
-    excluded: Excluded | None,
+    excluded: Spans | None,
 ) -> tuple[np.ndarray, ...]:
-    """The first 13 arguments of every body; what does not fit is refused here, as bodies read without looking."""
+    """The first 14 arguments of every body; what does not fit is refused here, as bodies read without looking."""
     assert tree.cells.shape[1] == corners, f"a tree over primitives of {corners} vertices is needed"
     x = np.ascontiguousarray(x, np.float64)
     assert x.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
@@ -174,11 +174,12 @@ def _common(
     own = _numbers(own, k, len(meets))
     if grouped:
         reaches[~np.any(meets, axis=1)[own]] = -1.0
-    start, ids = (np.zeros(1, np.int64), np.zeros(1, np.int32)) if excluded is None else excluded
-    vertex = _numbers(vertex, k, NONE if excluded is None else len(start) - 1)
+    listed = (
+        Spans(np.zeros(1, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)) if excluded is None else excluded
+    )
+    vertex = _numbers(vertex, k, NONE if excluded is None else len(listed.start) - 1)
     sizes = np.array([grouped, meets.shape[1], excluded is not None], np.int64)
-    start, ids = np.ascontiguousarray(start, np.int64), np.ascontiguousarray(ids, np.int32)
-    asked = reaches, sizes, meets, own, vertex, start, ids
+    asked = reaches, sizes, meets, own, vertex, *listed
     return tree.nodes, tree.boxes, tree.order, tree.sorted_cells, x, *asked, tree.margin
 
 
@@ -200,18 +201,16 @@ def _closest_triangles(arguments, low, high):
     order, cells, x = array(arguments, 2, np.int32), rows(arguments, 3, 3, np.int32), rows(arguments, 4, 3, np.float64)
     reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
     own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
-    start, ids = array(arguments, 10, np.int64), array(arguments, 11, np.int32)
-    margin = array(arguments, 12, np.float64)
-    points, behind = rows(arguments, 13, 3, np.float64), array(arguments, 14, np.int64)[0]
-    directed, against = array(arguments, 14, np.int64)[1], rows(arguments, 18, 3, np.float64)
-    found, weights = array(arguments, 15, np.int32), rows(arguments, 16, 3, np.float64)
-    distance = array(arguments, 17, np.float64)
+    start, first, past = array(arguments, 10, np.int64), array(arguments, 11, np.int32), array(arguments, 12, np.int32)
+    margin = array(arguments, 13, np.float64)
+    points, behind = rows(arguments, 14, 3, np.float64), array(arguments, 15, np.int64)[0]
+    directed, against = array(arguments, 15, np.int64)[1], rows(arguments, 19, 3, np.float64)
+    found, weights = array(arguments, 16, np.int32), rows(arguments, 17, 3, np.float64)
+    distance = array(arguments, 18, np.float64)
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
     stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
-    starts, noted = scratch(STARTS, np.int32), scratch(SLOTS, np.int64)
+    starts, corners = scratch(STARTS, np.int32), scratch(CORNERS, np.float64)
     slack = slack_of(boxes)
-    for j in range(SLOTS if listed else 0):
-        noted[j] = 0
     n_start = 0
     for q in range(low, high):
         if (q - low) % BUNCH == 0:
@@ -222,7 +221,7 @@ def _closest_triangles(arguments, low, high):
                     lowest, highest = lower_corner(lowest, p), upper_corner(highest, p)
             farthest, together = common_ground(reach, own, n_group, grouped, q, last)
             if farthest >= 0.0:
-                n_start = find_starts(nodes, boxes, meets, together, lowest, highest, farthest, starts, stack)
+                n_start = find_starts(nodes, boxes, meets, together, lowest, highest, farthest, starts, corners, stack)
         found[q], distance[q] = -1, np.inf
         weights[q, 0] = weights[q, 1] = weights[q, 2] = 0.0
         if not reach[q] >= 0.0:
@@ -233,22 +232,21 @@ def _closest_triangles(arguments, low, high):
         u = v = w = 0.0
         best = least = most = np.inf
         within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
-        top = begin(boxes, starts, n_start, p, p, within, stack, gaps)
-        left_out = start[vertex[q] + 1] - start[vertex[q]] if listed and top > 0 else 0
-        for j in range(left_out if 2 * left_out <= SLOTS else 0):
-            note(noted, q - low + 1, ids[start[vertex[q]] + j])
+        top = begin(starts, corners, n_start, p, p, within, stack, gaps)
+        if listed:
+            top = leave_out(nodes, start, first, past, vertex[q], stack, gaps, top)
+        put_nearest_on_top(stack, gaps, top)
+        end = start[vertex[q] + 1] if listed else 0
         while True:
             i, top = next_leaf(nodes, boxes, meets, row, p, p, within, stack, gaps, top)
             if i < 0:
                 break
+            r = seek(start, past, vertex[q], nodes[i, 1]) if listed else end
             for e in range(nodes[i, 1], nodes[i, 2]):
+                r, left_out = go_on(first, past, r, end, e)
+                if left_out:
+                    continue
                 t = order[e]
-                if left_out > 0:
-                    if 2 * left_out > SLOTS:
-                        if is_listed(start, ids, vertex[q], t):
-                            continue
-                    elif is_noted(noted, q - low + 1, t):
-                        continue
                 a, b, c = point(x, cells[e, 0]), point(x, cells[e, 1]), point(x, cells[e, 2])
                 weight, offset, d2 = closest_on_triangle(p, a, b, c)
                 if not d2 <= most or (d2 >= least and t > closest):  # not a number is not found
@@ -274,17 +272,16 @@ def _closest_edges(arguments, low, high):
     nodes, boxes = rows(arguments, 0, 4, np.int32), rows(arguments, 1, 6, np.float64)
     order, cells, x = array(arguments, 2, np.int32), rows(arguments, 3, 2, np.int32), rows(arguments, 4, 3, np.float64)
     reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
-    own, start, ids = array(arguments, 8, np.int32), array(arguments, 10, np.int64), array(arguments, 11, np.int32)
-    margin = array(arguments, 12, np.float64)
-    edges, found = rows(arguments, 13, 2, np.int32), array(arguments, 14, np.int32)
-    s, t = array(arguments, 15, np.float64), array(arguments, 16, np.float64)
-    distance = array(arguments, 17, np.float64)
+    own, start = array(arguments, 8, np.int32), array(arguments, 10, np.int64)
+    first, past = array(arguments, 11, np.int32), array(arguments, 12, np.int32)
+    margin = array(arguments, 13, np.float64)
+    edges, found = rows(arguments, 14, 2, np.int32), array(arguments, 15, np.int32)
+    s, t = array(arguments, 16, np.float64), array(arguments, 17, np.float64)
+    distance = array(arguments, 18, np.float64)
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
     stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
-    starts, noted = scratch(STARTS, np.int32), scratch(SLOTS, np.int64)
+    starts, corners = scratch(STARTS, np.int32), scratch(CORNERS, np.float64)
     slack = slack_of(boxes)
-    for j in range(SLOTS if listed else 0):
-        noted[j] = 0
     n_start = 0
     for q in range(low, high):
         if (q - low) % BUNCH == 0:
@@ -298,7 +295,7 @@ def _closest_edges(arguments, low, high):
                     )
             farthest, together = common_ground(reach, own, n_group, grouped, q, last)
             if farthest >= 0.0:
-                n_start = find_starts(nodes, boxes, meets, together, lowest, highest, farthest, starts, stack)
+                n_start = find_starts(nodes, boxes, meets, together, lowest, highest, farthest, starts, corners, stack)
         found[q], s[q], t[q], distance[q] = -1, 0.0, 0.0, np.inf
         if not reach[q] >= 0.0:
             continue
@@ -310,30 +307,31 @@ def _closest_edges(arguments, low, high):
         along, across = 0.0, 0.0
         best = least = most = np.inf
         within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
-        top = begin(boxes, starts, n_start, lowest, highest, within, stack, gaps)
-        left_out = start[v + 1] - start[v] + start[w + 1] - start[w] if listed and top > 0 else 0
-        if 2 * left_out <= SLOTS:
-            for j in range(start[v], start[v + 1] if left_out > 0 else start[v]):
-                note(noted, q - low + 1, ids[j])
-            for j in range(start[w], start[w + 1] if left_out > 0 else start[w]):
-                note(noted, q - low + 1, ids[j])
+        top = begin(starts, corners, n_start, lowest, highest, within, stack, gaps)
+        if listed:
+            top = leave_out(nodes, start, first, past, v, stack, gaps, top)
+            top = leave_out(nodes, start, first, past, w, stack, gaps, top)
+        put_nearest_on_top(stack, gaps, top)
+        r_end, h_end = (start[v + 1], start[w + 1]) if listed else (0, 0)
         while True:
             i, top = next_leaf(nodes, boxes, meets, row, lowest, highest, within, stack, gaps, top)
             if i < 0:
                 break
+            r = seek(start, past, v, nodes[i, 1]) if listed else r_end
+            h = seek(start, past, w, nodes[i, 1]) if listed else h_end
             for e in range(nodes[i, 1], nodes[i, 2]):
+                r, by_v = go_on(first, past, r, r_end, e)
+                h, by_w = go_on(first, past, h, h_end, e)
+                if by_v or by_w:
+                    continue
                 edge = order[e]
                 c, d = cells[e, 0], cells[e, 1]
                 if c == v or c == w or d == v or d == w:  # noqa: SIM109 (a tuple would be searched)
-                    continue
-                if left_out > 0 and 2 * left_out <= SLOTS and is_noted(noted, q - low + 1, edge):
                     continue
                 s1, t1, _, d2 = closest_segments(a, b, point(x, c), point(x, d))
                 if not d2 <= most or (d2 >= least and edge > closest):
                     continue
                 if d2 > squared(reach[q] + max(margin[c], margin[d])):
-                    continue
-                if 2 * left_out > SLOTS and (is_listed(start, ids, v, edge) or is_listed(start, ids, w, edge)):
                     continue
                 best, closest, along, across = d2, edge, s1, t1
                 least, most = same_as(best, slack)
@@ -349,9 +347,9 @@ def _containing_tets(arguments, low, high):
     order, cells, x = array(arguments, 2, np.int32), rows(arguments, 3, 4, np.int32), rows(arguments, 4, 3, np.float64)
     reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
     own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
-    start, ids = array(arguments, 10, np.int64), array(arguments, 11, np.int32)
-    points, named = rows(arguments, 13, 3, np.float64), array(arguments, 14, np.int64)[0]
-    found, weights = array(arguments, 15, np.int32), rows(arguments, 16, 4, np.float64)
+    start, first, past = array(arguments, 10, np.int64), array(arguments, 11, np.int32), array(arguments, 12, np.int32)
+    points, named = rows(arguments, 14, 3, np.float64), array(arguments, 15, np.int64)[0]
+    found, weights = array(arguments, 16, np.int32), rows(arguments, 17, 4, np.float64)
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
     stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
     for q in range(low, high):
@@ -374,7 +372,7 @@ def _containing_tets(arguments, low, high):
                 (wa, wb, wc, wd), _ = tet_weights(p, point(x, a), point(x, b), point(x, c), point(x, d))
                 if not (wa >= 0.0 and wb >= 0.0 and wc >= 0.0 and wd >= 0.0):
                     continue
-                if listed and is_listed(start, ids, v, t):
+                if listed and go_on(first, past, seek(start, past, v, e), start[v + 1], e)[1]:
                     continue
                 lowest = t
                 weights[q, 0], weights[q, 1], weights[q, 2], weights[q, 3] = wa, wb, wc, wd

@@ -1,9 +1,33 @@
 """Which cells lie around a vertex: what it must not be found in contact with."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pbng.jit import serial
 from pbng.topology import incidence
+
+
+class Spans(NamedTuple):
+    """Some primitives for each vertex, by where a tree has them: near ones follow each other there.
+
+    Attributes:
+        start: Those of vertex v are the spans ``start[v] .. start[v + 1]``, (n_vert + 1,) int64.
+        low, high: Its first place in the order of the tree, and the first past its last, int32; sorted, and apart.
+    """
+
+    start: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def spans(order: np.ndarray, start: np.ndarray, ids: np.ndarray) -> Spans:
+    """Where the primitives ``ids[start[v]:start[v + 1]]`` of each vertex are in an ``order`` (m,) of all."""
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    found, low, high = np.zeros(len(start), np.int64), np.empty(len(ids), np.int32), np.empty(len(ids), np.int32)
+    _join(place, start, ids, found, low, high)
+    return Spans(found, low[: found[-1]].copy(), high[: found[-1]].copy())
 
 
 def neighbourhoods(cells: np.ndarray, n_vert: int, rings: int) -> tuple[np.ndarray, np.ndarray]:
@@ -60,3 +84,17 @@ def _count(cells, first, incident, rings, seen_cell, seen_vertex, start, ids):
             ids[start[v] : start[v + 1]] = np.sort(found[:count])
         else:
             start[v + 1] = start[v] + count
+
+
+@serial
+def _join(place, start, ids, found, low, high):
+    """Join places that follow each other to spans."""
+    n = 0
+    for v in range(len(start) - 1):
+        for e in np.sort(place[ids[start[v] : start[v + 1]]]):
+            if n > found[v] and high[n - 1] == e:
+                high[n - 1] = e + 1
+            else:
+                low[n], high[n] = e, e + 1
+                n += 1
+        found[v + 1] = n
