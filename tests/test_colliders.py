@@ -332,18 +332,6 @@ def test_whoever_else_is_asked_about(name, motion):
     assert found == len(every.vertex)
 
 
-@pytest.mark.parametrize("reach", [0.0, 0.05])
-def test_a_plane_at_rest_holds_who_it_would_hold_in_motion(reach):
-    plane = Plane((0.1, 0.2, 0.3), (1.0, 2.0, -0.5), thickness=0.01)
-    before = points(2000, 21)
-    after = before + 0.2 * points(2000, 22)
-    rest, other = plane.touch(before, after, 0.0, 0.1, reach), Collider.touch(plane, before, after, 0.0, 0.1, reach)
-    assert (rest.vertex == other.vertex).all()
-    assert np.allclose(rest.normal, other.normal)
-    room = np.einsum("ki,ki->k", rest.point - other.point, rest.normal)
-    assert np.abs(room).max() < 1e-13
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_nothing_to_ask(name):
     nothing = np.empty((0, 3))

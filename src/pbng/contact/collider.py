@@ -1,14 +1,13 @@
 """Colliders: bodies that do not deform, or as prescribed, and that soft bodies collide with (section 7.2).
 
 A collider answers where its surface is (:meth:`Collider.distance`) and which half-spaces moving points have to respect
-in a step (:meth:`Collider.touch`). The shapes are in ``colliders.py``, meshes in ``kinematic.py``.
+in a step (:meth:`Collider.touch`). Shapes are in ``colliders.py`` and ``touching.py``, meshes in ``kinematic.py``.
 """
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from pbng.motions import Affine, Motion, as_motion
 
 PIECE = 0.1  # largest angle [rad] a body turns by in one straight piece of the paths that points take relative to it
 PIECES = 64
-NEWTON = 64  # a grazing path converges linearly, by halves
 ON_SURFACE = 1e-9  # of the length of a path: what counts as having arrived
 
 Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3) and p (3,) of x = R X + p
@@ -95,14 +93,6 @@ class Collider(ABC):
         """What rotations turn about, at rest [m], (3,)."""
 
     @abstractmethod
-    def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Signed distance, closest point and outward normal for points (k, 3) in the body's frame."""
-
-    def _clearance(self, X: np.ndarray) -> np.ndarray:
-        """Signed distance alone."""
-        return self._near(X)[0]
-
-    @abstractmethod
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         """Points and outward triangles of the surface at rest."""
 
@@ -120,16 +110,15 @@ class Collider(ABC):
         R, c = self.motion.linear(s), self._center
         return R, c - R @ c + self.motion.shift(s, c)
 
+    @abstractmethod
     def distance(self, points: np.ndarray, t: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where points (k, 3) [m] are at time t [s]; the thickness does not count.
 
         Returns the signed distance [m] (k,), negative inside, the closest point of the surface (k, 3) and the unit
         outward normal there (k, 3), which is the gradient of the distance.
         """
-        pose = self._pose(t)
-        d, closest, normal = self._near(to_body(pose, np.asarray(points, float)))
-        return d, to_world(pose, closest), turned(pose, normal)
 
+    @abstractmethod
     def touch(self, before: np.ndarray, after: np.ndarray, t0: float, t1: float, reach: Any = 0.0) -> Touches:
         """What points have to respect at t1 that move from ``before`` at t0 to ``after`` (predicted) at t1 [s].
 
@@ -145,73 +134,12 @@ class Collider(ABC):
             t0, t1: Beginning and end of the step [s].
             reach: How near to the thickened surface counts as near [m], one for all or (k,).
         """
-        before, after = np.asarray(before, float), np.asarray(after, float)
-        margin = np.broadcast_to(np.asarray(reach, float), len(before)) + self.thickness
-        poses = self._poses(t0, t1)
-        rests = poses[0] is poses[-1]
-        moved = norms(after - before)  # most points are too far away, and quickly told
-        d = self._clearance(to_body(poses[0], before))
-        every = np.flatnonzero(d <= margin + moved + (0.0 if rests else _sway(poses, before, moved)))
-        before, after, margin, d = before[every], after[every], margin[every], d[every]
-        shares = np.linspace(0, 1, len(poses))[1:-1]
-        between = [to_body(p, (1 - f) * before + f * after) for f, p in zip(shares, poses[1:-1])]
-        path = [to_body(poses[0], before), *between, to_body(poses[-1], after)]
-        left = path[0] if rests else to_body(poses[-1], before)
-        length = np.sum([norms(b - a) for a, b in pairwise(path)], axis=0)
-        near = d <= margin + np.maximum(length, norms(left - path[0]))
-        index = every[near]
-        path, left, d, length, margin = [p[near] for p in path], left[near], d[near], length[near], margin[near]
-
-        d1, point, normal = self._near(path[-1])
-        chosen = (d1 < margin) | (d < margin)
-        if not rests:
-            chosen |= self._clearance(left) < margin
-        inside = d < -ON_SURFACE * length
-        _, point[inside], normal[inside] = self._near(path[0][inside])
-        open_ = np.flatnonzero(~inside & (d <= length))
-        for a, b in pairwise(path):
-            hit, where, direction = self._sweep(a[open_], b[open_])
-            point[open_[hit]], normal[open_[hit]] = where[hit], direction[hit]
-            chosen[open_[hit]] = True
-            open_ = open_[~hit]
-        chosen |= inside
-        return self._touches(index[chosen], point[chosen], normal[chosen], poses[-1])
-
-    def _touches(self, index: np.ndarray, X: np.ndarray, N: np.ndarray, pose: Pose | None) -> Touches:
-        """What holds points at X with normals N of the body's frame."""
-        n = turned(pose, N)
-        return Touches(index, to_world(pose, X) + self.thickness * n, n)
 
     def carried(self, points: np.ndarray, t0: float, t1: float) -> np.ndarray:
         """How far the collider's material at points (k, 3) at time t1 has moved since t0 [m], (k, 3)."""
         return points - to_world(self._pose(t0), to_body(self._pose(t1), points))
 
-    def _sweep(self, start: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which straight paths (k, 3) that begin outside meet the surface, and where with what normal they first do.
-
-        A step of Newton's method along the path ends where the tangent plane of the closest point is met, and the
-        body lies behind that plane.
-        """
-        path = stop - start
-        near = ON_SURFACE * norms(path)
-        share, hit = np.zeros(len(path)), np.zeros(len(path), bool)
-        point, normal = np.zeros_like(path), np.zeros_like(path)
-        moving = np.arange(len(path))
-        for _ in range(NEWTON):
-            if len(moving) == 0:
-                break
-            d, closest, n = self._near(start[moving] + share[moving, None] * path[moving])
-            slope = dots(n, path[moving])
-            arrived = (d <= near[moving]) & (slope < 0)
-            found = moving[arrived]
-            hit[found], point[found], normal[found] = True, closest[arrived], n[arrived]
-            going = ~arrived & (slope < 0)  # away from a convex body is away for good
-            moving = moving[going]
-            share[moving] -= d[going] / slope[going]
-            moving = moving[share[moving] <= 1]
-        return hit, point, normal
-
-    def _poses(self, t0: float, t1: float) -> list[Pose | None]:
+    def poses(self, t0: float, t1: float) -> list[Pose | None]:
         """Poses at t0, perhaps between, and at t1: at even shares of the motion; the same one twice if it rests."""
         first, last = self._pose(t0), self._pose(t1)
         s0, s1 = self.share(t0), self.share(t1)
@@ -246,17 +174,6 @@ def turn_rate(motion: Any, s0: float, s1: float) -> float:
     starts = [min(max(s, 0.0), 1.0 - h) for s in (s0, (s0 + s1) / 2, s1)]
     change = [motion.linear(s + h) @ motion.linear(s).T - np.eye(3) for s in starts]
     return max(float(np.linalg.norm(R)) for R in change) / (math.sqrt(2) * h)
-
-
-def _sway(poses: list[Pose | None], x: np.ndarray, moved: np.ndarray) -> float:
-    """How far [m] points at rest go in a body's frame at most, anywhere up to ``moved`` (k,) from x (k, 3)."""
-    if len(x) == 0:
-        return 0.0
-    middle = np.full(len(x), 1 / len(x)) @ x
-    radius = (norms(x - middle) + moved).max()
-    turns = [np.eye(3) if p is None else p[0] for p in poses]
-    ways = (np.linalg.norm(to_body(q, middle) - to_body(p, middle)) for p, q in pairwise(poses))
-    return float(sum(ways) + radius * sum(np.linalg.norm(S - R) for R, S in pairwise(turns)))
 
 
 def to_body(pose: Pose | None, x: np.ndarray) -> np.ndarray:

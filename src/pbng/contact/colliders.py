@@ -1,19 +1,51 @@
 """Colliders with a formula: planes, balls, capsules, boxes; and open containers made of planes."""
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from pbng.checks import checked_number, checked_vector
-from pbng.contact.collider import Collider, Touches, is_rigid, norms, to_body
+from pbng.contact.collider import Collider, Touches, is_rigid
+from pbng.contact.touching import BOX, NUMBERS, PLANE, ROUND, Shapes, distances
 from pbng.errors import InputError
 from pbng.motions import Affine
 
 
 @dataclass(frozen=True, eq=False)
-class Plane(Collider):
+class Shape(Collider):
+    """A collider with a formula, by numbers that :mod:`pbng.contact.touching` knows for its ``kind``."""
+
+    kind = -1  # PLANE, ROUND or BOX; no field, for it is not to be chosen
+
+    @abstractmethod
+    def _numbers(self) -> list[float]:
+        """The numbers, up to ``NUMBERS``, as many as there are."""
+
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """The numbers, (NUMBERS,)."""
+        numbers = np.zeros(NUMBERS)
+        given = self._numbers()
+        numbers[: len(given)] = given
+        return numbers
+
+    @cached_property
+    def _alone(self) -> Shapes:
+        return Shapes([self])
+
+    def distance(self, points: np.ndarray, t: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return distances(self.kind, self.numbers, self._pose(t), points)
+
+    def touch(self, before: np.ndarray, after: np.ndarray, t0: float, t1: float, reach: Any = 0.0) -> Touches:
+        return self._alone.touch(before, after, t0, t1, reach)[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Plane(Shape):
     """The half-space behind a plane: points are kept on the side that the normal points to.
 
     Args:
@@ -25,6 +57,7 @@ class Plane(Collider):
     point: Sequence[float]
     normal: Sequence[float]
     size: float | Sequence[float] = 4.0
+    kind = PLANE
 
     def __post_init__(self) -> None:
         self._set("point", checked_vector(f"{self.label}: point", self.point))
@@ -43,24 +76,8 @@ class Plane(Collider):
     def _center(self) -> np.ndarray:
         return np.array(self.point)
 
-    def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        n, d = np.array(self.normal), self._clearance(X)
-        return d, X - d[:, None] * n, np.tile(n, (len(X), 1))
-
-    def _clearance(self, X: np.ndarray) -> np.ndarray:
-        n = np.array(self.normal)
-        return X @ n - self._center @ n
-
-    def touch(self, before: np.ndarray, after: np.ndarray, t0: float, t1: float, reach: Any = 0.0) -> Touches:
-        """As of other colliders; wherever a path meets a plane at rest, the half-space is the same."""
-        poses = self._poses(t0, t1)
-        if poses[0] is not poses[-1]:
-            return super().touch(before, after, t0, t1, reach)
-        end = to_body(poses[-1], np.asarray(after, float))
-        d0, d1 = self._clearance(to_body(poses[0], np.asarray(before, float))), self._clearance(end)
-        chosen = (np.minimum(d0, d1) < np.asarray(reach, float) + self.thickness) | ((d1 <= 0) & (d1 < d0))
-        index = np.flatnonzero(chosen)
-        return self._touches(index, *self._near(end[index])[1:], poses[-1])
+    def _numbers(self) -> list[float]:
+        return [*self.normal, float(self._center @ self.normal)]
 
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         (u, v), (a, b) = _across(np.array(self.normal)), np.asarray(self.size) / 2
@@ -69,11 +86,12 @@ class Plane(Collider):
 
 
 @dataclass(frozen=True, eq=False)
-class Sphere(Collider):
+class Sphere(Shape):
     """A ball: ``center`` [m], (3,), and ``radius`` [m]."""
 
     center: Sequence[float]
     radius: float
+    kind = ROUND
 
     def __post_init__(self) -> None:
         self._set("center", checked_vector(f"{self.label}: center", self.center))
@@ -84,11 +102,8 @@ class Sphere(Collider):
     def _center(self) -> np.ndarray:
         return np.array(self.center)
 
-    def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return _rounded(X, self._center, self.radius, np.array([0.0, 1.0, 0.0]))
-
-    def _clearance(self, X: np.ndarray) -> np.ndarray:
-        return norms(X - self._center) - self.radius
+    def _numbers(self) -> list[float]:
+        return [*self.center, 0.0, 0.0, 0.0, self.radius, 0.0, 1.0, 0.0]
 
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         points, triangles = _capsule_mesh(0.0, self.radius)
@@ -96,12 +111,13 @@ class Sphere(Collider):
 
 
 @dataclass(frozen=True, eq=False)
-class Capsule(Collider):
+class Capsule(Shape):
     """All within ``radius`` [m] of the segment from ``a`` to ``b`` [m], (3,) each; rotations turn about its middle."""
 
     a: Sequence[float]
     b: Sequence[float]
     radius: float
+    kind = ROUND
 
     def __post_init__(self) -> None:
         self._set("a", checked_vector(f"{self.label}: a", self.a))
@@ -115,10 +131,9 @@ class Capsule(Collider):
     def _center(self) -> np.ndarray:
         return (np.array(self.a) + np.array(self.b)) / 2
 
-    def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        a, axis = np.array(self.a), np.array(self.b) - np.array(self.a)
-        s = np.clip((X - a) @ axis / (axis @ axis), 0.0, 1.0)
-        return _rounded(X, a + s[:, None] * axis, self.radius, _across(axis / np.linalg.norm(axis))[0])
+    def _numbers(self) -> list[float]:
+        axis = np.array(self.b) - np.array(self.a)
+        return [*self.a, *axis, self.radius, *_across(axis / np.linalg.norm(axis))[0]]
 
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         axis = np.array(self.b) - np.array(self.a)
@@ -129,11 +144,12 @@ class Capsule(Collider):
 
 
 @dataclass(frozen=True, eq=False)
-class Box(Collider):
+class Box(Shape):
     """A solid box from ``low`` to ``high`` [m], (3,) each, along the axes at rest."""
 
     low: Sequence[float]
     high: Sequence[float]
+    kind = BOX
 
     def __post_init__(self) -> None:
         low, high = _corners(self.label, self.low, self.high)
@@ -145,23 +161,8 @@ class Box(Collider):
     def _center(self) -> np.ndarray:
         return (np.array(self.low) + np.array(self.high)) / 2
 
-    def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        low, high = np.array(self.low), np.array(self.high)
-        closest = np.clip(X, low, high)
-        normal = X - closest
-        d = norms(normal)
-        out = d > 0
-        normal /= np.where(out, d, 1.0)[:, None]
-        within = np.flatnonzero(~out)
-        if len(within):  # the closest face, among equals the first of high x, y, z, low x, y, z
-            x = X[within]
-            depth = np.column_stack([high - x, x - low])
-            face = depth.argmin(1)
-            rows = np.arange(len(x))
-            d[within] = -depth[rows, face]
-            normal[within] = np.concatenate([np.eye(3), -np.eye(3)])[face]
-            closest[within, face % 3] = np.concatenate([high, low])[face]
-        return d, closest, normal
+    def _numbers(self) -> list[float]:
+        return [*self.low, *self.high]
 
     def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
         corner = np.array([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)])
@@ -217,18 +218,6 @@ def _across(n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     u = u - (u @ n) * n
     u /= np.linalg.norm(u)
     return u, np.cross(n, u)
-
-
-def _rounded(
-    X: np.ndarray, core: np.ndarray, radius: float, up: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance, closest point and normal of what is within a radius of a core's closest points; on the core: up."""
-    normal = X - core
-    d = norms(normal)
-    out = d > 0
-    normal /= np.where(out, d, 1.0)[:, None]
-    normal[~out] = up
-    return d - radius, core + radius * normal, normal
 
 
 def _capsule_mesh(half: float, radius: float, around: int = 48, rings: int = 12) -> tuple[np.ndarray, np.ndarray]:

@@ -5,11 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbng.contact.collider import Touches, dots, norms
+from pbng.contact.collider import dots, norms
+from pbng.contact.colliders import Shape
 from pbng.contact.contacts import Contacts
 from pbng.contact.halfspaces import HalfSpaces
 from pbng.contact.pairs import SurfaceDetector
 from pbng.contact.spec import CLOSE, NEAR, ContactSpec
+from pbng.contact.touching import Shapes
 from pbng.errors import InputError
 
 CREEP = 1e-3  # of the margin: ways shorter than this do not count as sliding
@@ -37,7 +39,10 @@ class Detector:
         self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
         self.free = spec.surface[~fixed[spec.surface]]
         self.reach = self.surfaces.radius if self.surfaces else spec.margin  # farther off, directions are of no use [m]
-        self.rubs = any(c.friction for c in spec.colliders)
+        self.shapes = Shapes([c for c in spec.colliders if isinstance(c, Shape)])
+        self.others = [c for c in spec.colliders if not isinstance(c, Shape)]
+        self.friction = np.array([c.friction for c in (*self.shapes.shapes, *self.others)])
+        self.rubs = bool(self.friction.any())
 
     def check(self, x: np.ndarray, t: float) -> None:
         """InputError if a body lies wholly inside another, or inside a collider at time t [s], at x (n_vert, 3)."""
@@ -76,10 +81,13 @@ class Detector:
         before, after, near = np.take(x0, self.free, 0), np.take(x1, self.free, 0), np.asarray(self.spec.margin + ahead)
         if dt is not None:
             near = CLOSE / NEAR * self.spec.margin + norms(after - before)
-        touches = [c.touch(before, after, t0, t1, near) for c in self.spec.colliders]
-        normal = np.concatenate([t.normal for t in touches])
-        vertex = self.free[np.concatenate([t.vertex for t in touches])].astype(np.int32)
-        level = dots(normal, np.concatenate([t.point for t in touches]))
+        which, (touching, point, normal) = self.shapes.touch(before, after, t0, t1, near)
+        for k, c in enumerate(self.others, len(self.shapes.shapes)):
+            more = c.touch(before, after, t0, t1, near)
+            which = np.concatenate([which, np.full(len(more.vertex), k)])
+            touching, point, normal = (np.concatenate(a) for a in zip((touching, point, normal), more))
+        vertex = self.free[touching].astype(np.int32)
+        level = dots(normal, point)
         self._cut(x0, vertex, normal, level)
         start, earlier = (x0, t0) if since is None else (since.x, since.t)
         return replace(
@@ -87,8 +95,8 @@ class Detector:
             vertex=vertex,
             plane=normal,
             level=level,
-            friction=self._friction(touches, vertex, normal, borne),
-            anchor=start[vertex] + self._slips(touches, earlier, t1),
+            friction=self._friction(which, vertex, normal, borne),
+            anchor=start[vertex] + self._slips(which, point, earlier, t1),
             creep=CREEP * self.spec.margin,
         )
 
@@ -105,13 +113,12 @@ class Detector:
         return self.surfaces.find(x0, x1, dt, ahead, hold, 0.0).plus(since.contacts.ties())
 
     def _friction(
-        self, touches: list[Touches], vertex: np.ndarray, normal: np.ndarray, borne: np.ndarray | None
+        self, which: np.ndarray, vertex: np.ndarray, normal: np.ndarray, borne: np.ndarray | None
     ) -> np.ndarray:
         """What friction may bear of each half-space [N]: its coefficient times what was last borne along the normal."""
-        coefficient = np.repeat([c.friction for c in self.spec.colliders], [len(t.vertex) for t in touches])
-        if borne is None or not coefficient.any():
+        if borne is None or not self.rubs:
             return np.zeros(len(vertex))
-        return coefficient * HalfSpaces(vertex, normal).move_in(-borne, np.zeros(len(vertex)), far=np.inf)
+        return self.friction[which] * HalfSpaces(vertex, normal).move_in(-borne, np.zeros(len(vertex)), far=np.inf)
 
     def _cut(self, x: np.ndarray, vertex: np.ndarray, normal: np.ndarray, level: np.ndarray) -> None:
         """Make half-spaces, in place, what vertices of plane bodies see: cut by their plane, in which they stay."""
@@ -126,10 +133,10 @@ class Detector:
             aside = flat[(normal[flat] == 0).all(1)]
             level[aside] = -np.inf
 
-    def _slips(self, touches: list[Touches], t0: float, t1: float) -> np.ndarray:
+    def _slips(self, which: np.ndarray, points: np.ndarray, t0: float, t1: float) -> np.ndarray:
         """How far what would stick to the colliders is carried from time t0 to t1, where they rub, (k, 3) [m]."""
-        slips = [
-            c.carried(q.point, t0, t1) if c.friction else np.zeros((len(q.vertex), 3))
-            for c, q in zip(self.spec.colliders, touches)
-        ]
-        return np.concatenate(slips)
+        slips = np.zeros((len(which), 3))
+        for k, c in enumerate((*self.shapes.shapes, *self.others)):
+            if c.friction and c.motion is not None:
+                slips[which == k] = c.carried(points[which == k], t0, t1)
+        return slips

@@ -209,10 +209,6 @@ class Kinematic(Collider):
         near = self._closest(self._shape(t), to_body(pose, np.asarray(points, float)))
         return near.distance, to_world(pose, near.point), turned(pose, near.normal)
 
-    def _near(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        near = self._closest(self._rest, X)
-        return near.distance, near.point, near.normal
-
     def _closest(self, shape: _Shape, points: np.ndarray, reach: Any = np.inf) -> _Near:
         """The closest points of a surface; only those within reach."""
         triangle, weights, d = closest_triangles(self._fitted(shape, shape), shape.x, points, reach)
@@ -231,7 +227,7 @@ class Kinematic(Collider):
         before, after = np.asarray(before, float), np.asarray(after, float)
         margin = np.broadcast_to(np.asarray(reach, float), len(before)) + self.thickness
         shapes = [self._rest] if self._rigid else self._shapes(t0, t1)
-        poses = self._poses(t0, t1) if self._rigid else [None] * len(shapes)
+        poses = self.poses(t0, t1) if self._rigid else [None] * len(shapes)
         shapes = shapes * len(poses) if self._rigid else shapes
         first, last = shapes[0], shapes[-1]
         rests = first is last and poses[0] is poses[-1]
