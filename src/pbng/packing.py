@@ -133,20 +133,20 @@ class Layout:
     def numbering(self, order: np.ndarray, color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First block of each colour, and the vertex in each place of the blocks, -1 in padding lanes.
 
-        ``order`` lists the vertices, and ``color`` (n_vert,) their colours.
+        ``order`` (n,) lists the vertices, and ``color`` (n,) their colours.
         """
-        several = len(self.groups.table) > 1
-        node, color_start = [], [0]
-        color = color[order]
-        for c in range(color.max() + 1 if len(order) else 0):
-            mine = order[color == c]
-            if several:
-                mine = mine[np.argsort(self.touched[mine], kind="stable")]
-            window = np.arange(len(mine)) // WINDOW
-            mine = mine[np.lexsort((-self.valence[mine], self.touched[mine] if several else window, window))]
-            node.append(np.concatenate([mine, np.full(-len(mine) % W, -1)]))
-            color_start.append(color_start[-1] + len(node[-1]) // W)
-        return np.array(color_start), np.concatenate(node) if node else np.empty(0, np.int64)
+        by_color = np.argsort(color, kind="stable")
+        if len(self.groups.table) > 1:
+            by_color = np.lexsort((self.touched[order], color))
+        order, color = order[by_color], color[by_color]
+        place = np.arange(len(order)) - np.searchsorted(color, color)  # within the colour
+        window = place // WINDOW
+        touched = self.touched[order] if len(self.groups.table) > 1 else window
+        order = order[np.lexsort((-self.valence[order], touched, window, color))]
+        color_start = np.concatenate([[0], np.cumsum(-(-np.bincount(color) // W))])
+        node = np.full(W * color_start[-1], -1)
+        node[W * color_start[color] + place] = order
+        return color_start, node
 
     def rows(self, node: np.ndarray, places: np.ndarray, n_block: int) -> "Rows":
         """The rows of blocks of nodes (n,), -1 in padding lanes, the first ``n_block`` of which are of vertices.
@@ -187,7 +187,8 @@ def pack_problem(problem: Problem, dtype: Any = np.float32, paper_block: bool = 
     compounds = Compounds(problem) if problem.weak else None
     compounds = compounds if compounds and compounds.n else None
     layout = Layout(problem, dtype, paper_block, compounds)
-    color_start, node = layout.numbering(problem.order[problem.color[problem.order] >= 0], problem.color)
+    free = problem.order[problem.color[problem.order] >= 0]
+    color_start, node = layout.numbering(free, problem.color[free])
     n_color, n_block = len(color_start) - 1, len(node) // W
     if compounds:
         node, color_start = _with_compounds(problem, compounds, node, color_start)

@@ -116,7 +116,7 @@ class ContactNodes:
         """Lay out nodes in blocks behind those that there are. Whether there is room."""
         node = np.concatenate([node, self._next(node)])
         layout, order = self.packed.layout, node[np.argsort(self.rank[node])]
-        color_start, owner = layout.numbering(order, self.color)
+        color_start, owner = layout.numbering(order, self.color[order])
         if not self.blocks.append(color_start, layout.rows(owner, self.packed.places, len(owner) // W)):
             return False
         real = owner >= 0
