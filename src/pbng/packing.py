@@ -273,10 +273,10 @@ def _padded(nodal: np.ndarray, real: np.ndarray) -> np.ndarray:
 
 def _merge(spans: list) -> tuple[np.ndarray, np.ndarray]:
     """Segments of several kinds, brought together block by block."""
-    block = np.concatenate([np.repeat(np.arange(len(s) - 1), np.diff(s)) for s, _ in spans])
+    counts = np.array([s[1:] - s[:-1] for s, _ in spans])
+    block = np.repeat(np.tile(np.arange(counts.shape[1]), len(counts)), counts.ravel())
     seg = np.concatenate([s for _, s in spans])[np.argsort(block, kind="stable")]
-    counts = sum(np.diff(s) for s, _ in spans)
-    return np.concatenate([[0], np.cumsum(counts)]), seg
+    return np.concatenate([[0], np.cumsum(counts.sum(0))]), seg
 
 
 @serial

@@ -210,8 +210,8 @@ class Blocks:
             a[first:last] = more
         self.seg_start = np.concatenate([self.seg_start, len(self.seg) + rows.seg_start[1:]])
         self.seg = np.concatenate([self.seg, rows.seg + np.array([0, 0, 0, *self.used[:2]])])
-        more = self.color_start[-1] + np.unique(color_start)  # a set of no blocks would cost as much as a small one
-        self.color_start = np.concatenate([self.color_start, more[1:]])
+        more = color_start[1:][np.diff(color_start) > 0]  # a set of no blocks would cost as much as a small one
+        self.color_start = np.concatenate([self.color_start, self.color_start[-1] + more])
         self.used = end
         return True
 

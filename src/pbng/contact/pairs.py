@@ -121,20 +121,20 @@ class SurfaceDetector:
         reach = radius + 2 * float(s.skin.max(initial=0.0)) + moved
         self.normals.fit(x0)
         self.triangles.refit(x0, margin=moved)
-        if len(self.edges):
-            self.edge_tree.refit(x0, margin=moved)
-        one, other = self.edge_ends
-        edge_reach = np.maximum(reach[one], reach[other])
-        pairs = []
+        pairs, own_edges = [], np.empty(0, np.int64)
         if self.several:
             pairs.append(self._vertex_triangle(x0, reach, self.meets_others, None))
-            pairs.append(self._edge_edge(x0, edge_reach, self.meets_later, None))
         if self.any_own:
             pairs.append(self._vertex_triangle(x0, reach, self.meets_itself, self.near_triangles))
             seen = np.zeros(len(x0), bool)  # where a surface comes near itself, vertices tell
             seen[pairs[-1].vertices] = True
-            edge_reach[~(seen[one] | seen[other])] = -1.0
-            pairs.append(self._edge_edge(x0, edge_reach, self.meets_itself, self.near_edges))
+            own_edges = np.flatnonzero(seen[self.edge_ends[0]] | seen[self.edge_ends[1]])
+        if self.several or len(own_edges):
+            self.edge_tree.refit(x0, margin=moved)
+        if self.several:
+            pairs.append(self._edge_edge(x0, slice(None), reach, self.meets_later, None))
+        if len(own_edges):
+            pairs.append(self._edge_edge(x0, own_edges, reach, self.meets_itself, self.near_edges))
         found = Pairs(*(np.concatenate(a) for a in zip(*pairs)))
         if self.any_fixed:
             found = found.some(~self.fixed[found.vertices].all(1))
@@ -153,9 +153,16 @@ class SurfaceDetector:
         np.negative(weights, w[:, 1:])
         return Pairs(stencil, w, self.normals.at(triangle, weights), inside[found])
 
-    def _edge_edge(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Spans | None) -> Pairs:
-        asked: dict[str, Any] = {"own": self.edge_body, "meets": meets, "excluded": excluded}
-        other, s, t, _ = closest_edges(self.edge_tree, x, self.edges, reach, **asked)
+    def _edge_edge(
+        self, x: np.ndarray, edges: slice | np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Spans | None
+    ) -> Pairs:
+        """What some of the edges make pairs with."""
+        asked: dict[str, Any] = {"own": self.edge_body[edges], "meets": meets, "excluded": excluded}
+        one, two = self.edge_ends[:, edges]
+        other, s, t = np.full(len(self.edges), -1, np.int32), np.empty(len(self.edges)), np.empty(len(self.edges))
+        other[edges], s[edges], t[edges], _ = closest_edges(
+            self.edge_tree, x, self.edges[edges], np.maximum(reach[one], reach[two]), **asked
+        )
         mine = np.flatnonzero(other >= 0)
         m = len(mine)
         stencil, weights, outward = np.empty((m, 4), np.int32), np.empty((m, 4)), np.empty((m, 3))

@@ -4,6 +4,7 @@ Compiled, and of all shapes at once: a scene with five walls asks as fast as one
 """
 
 from collections.abc import Sequence
+from itertools import accumulate
 from math import sqrt
 from typing import Any
 
@@ -56,7 +57,7 @@ class Shapes:
         n, m = len(before), len(self.shapes)
         poses = [s.poses(t0, t1) for s in self.shapes]
         poses = [p[:1] if p[0] is p[-1] else p for p in poses]
-        first = np.cumsum([0, *(len(p) for p in poses)])
+        first = np.array([0, *accumulate(len(p) for p in poses)])
         before, after = np.ascontiguousarray(before, float), np.ascontiguousarray(after, float)
         reach = np.array(np.broadcast_to(np.asarray(reach, float), (n,)))
         chosen, where, normal = np.empty(n * m, np.bool_), np.empty((n * m, 3)), np.empty((n * m, 3))
