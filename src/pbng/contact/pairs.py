@@ -29,6 +29,7 @@ from pbng.topology import edge_sides
 
 FARTHER = 1.5  # than it is expected to go may a vertex go in a step with inertia
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
+ASIDE = 0.5  # cosine of the angle between two parts of a solid's surface below which they may face each other
 ROOM = 1e-6  # of the distance that is kept, by which surfaces at rest may be too close
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
 GRAIN = 256  # pairs of edges that a thread takes at a time
@@ -56,6 +57,7 @@ class SurfaceDetector:
         tell = Sides(self.normals, start, sides)
         self.insides = Insides(s, X, self.vertex, self.body, self.triangles, self.normals, tell)
         self.solid = self.insides.solid
+        self.facing = 1.0 * self.solid[self.insides.own][:, None]  # cloth faces both ways
         self.edges, self.beside = self._sharp_edges(edges, start, sides)
         self.edge_ends = np.ascontiguousarray(self.edges.T)
         self.edge_body = self.body[self.edge_ends[0]]
@@ -143,6 +145,8 @@ class SurfaceDetector:
     def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Spans | None) -> Pairs:
         vertex, reach = self.vertex, reach[self.vertex]
         asked: dict[str, Any] = {"own": self.insides.own, "meets": meets, "vertex": vertex, "excluded": excluded}
+        if excluded is not None:
+            asked |= {"against": self.normals.around_vertices(vertex) * self.facing, "limit": ASIDE}
         closest = closest_triangles(self.triangles, x, x[vertex], reach, **asked)
         triangle, weights, inside = self.insides.touched(x, closest, reach, meets, excluded)
         found = np.flatnonzero(triangle >= 0)

@@ -55,6 +55,7 @@ def closest_triangles(
     excluded: Spans | None = None,
     behind: bool = False,
     against: np.ndarray | None = None,
+    limit: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The triangle of a tree closest to each point.
 
@@ -66,7 +67,8 @@ def closest_triangles(
             of its vertices (:meth:`pbng.contact.bvh.BoxTree.refit`); below 0 a point is not asked.
         own, meets, vertex, excluded: What may be found, see above.
         behind: Find only triangles that the point is behind: (point - closest point) · normal < 0.
-        against: Directions (k, 3): find only triangles whose normals do not point along them.
+        against: Directions (k, 3): find only triangles whose normals do not point along them, all where one is zero.
+        limit: Cosine of the angle from which on a normal does not, from 0 to 1.
 
     Returns:
         Triangles (k,) int32, -1 for none; weights (k, 3) of the closest points; distances (k,) [m], infinite for none.
@@ -78,7 +80,7 @@ def closest_triangles(
     found, weights, distance = np.empty(k, np.int32), np.empty((k, 3)), np.empty(k)
     flags = np.array([behind, against is not None], np.int64)
     against = np.zeros((1, 3)) if against is None else np.ascontiguousarray(against, np.float64)
-    arrays = (points, flags, found, weights, distance, against)
+    arrays = (points, flags, found, weights, distance, against, np.array([limit * limit]))
     each(_closest_triangles, (*_common(tree, 3, x, k, reach, own, meets, vertex, excluded), *arrays), k, GRAIN)
     return found, weights, distance
 
@@ -206,7 +208,7 @@ def _closest_triangles(arguments, low, high):
     points, behind = rows(arguments, 14, 3, np.float64), array(arguments, 15, np.int64)[0]
     directed, against = array(arguments, 15, np.int64)[1], rows(arguments, 19, 3, np.float64)
     found, weights = array(arguments, 16, np.int32), rows(arguments, 17, 3, np.float64)
-    distance = array(arguments, 18, np.float64)
+    distance, limit2 = array(arguments, 18, np.float64), array(arguments, 20, np.float64)[0]
     grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
     stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
     starts, corners = scratch(STARTS, np.int32), scratch(CORNERS, np.float64)
@@ -248,14 +250,17 @@ def _closest_triangles(arguments, low, high):
                     continue
                 t = order[e]
                 a, b, c = point(x, cells[e, 0]), point(x, cells[e, 1]), point(x, cells[e, 2])
+                n = cross(sub(b, a), sub(c, a)) if directed or behind else p
+                if directed:
+                    along = dot(point(against, q), n)
+                    if along > 0.0 and along * along > limit2 * dot(n, n) * dot(point(against, q), point(against, q)):
+                        continue
                 weight, offset, d2 = closest_on_triangle(p, a, b, c)
                 if not d2 <= most or (d2 >= least and t > closest):  # not a number is not found
                     continue
                 if d2 > squared(reach[q] + max(margin[cells[e, 0]], margin[cells[e, 1]], margin[cells[e, 2]])):
                     continue
-                if behind and not dot(offset, cross(sub(b, a), sub(c, a))) > 0.0:
-                    continue
-                if directed and not dot(point(against, q), cross(sub(b, a), sub(c, a))) <= 0.0:
+                if behind and not dot(offset, n) > 0.0:
                     continue
                 best, closest = d2, t
                 u, v, w = weight
