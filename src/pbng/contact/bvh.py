@@ -26,6 +26,8 @@ class BoxTree:
             group, or -1 where there are several. Parents come before children, level by level.
         boxes: Lowest and highest corner of each node, (n, 6) [m].
         margin: By how much they are wider about each vertex than it is, (n_vert,) [m].
+        way: Where each vertex is expected to go, (n_vert, 3) [m], or None; ``ways`` (n, 6) are boxes about the ways of
+            each node's vertices.
     """
 
     def __init__(self, x: np.ndarray, cells: np.ndarray, group: np.ndarray | None = None, leaf: int = LEAF) -> None:
@@ -51,31 +53,46 @@ class BoxTree:
         if len(levels) > DEPTH:
             raise InputError(f"BoxTree: {len(levels)} levels; at most {DEPTH} are supported")
         self.sorted_cells = self.cells[self.order]
-        self.boxes = np.empty((len(self.nodes), 6))
+        self.boxes, self.ways = np.empty((2, len(self.nodes), 6))
         # Levels from the lowest up, the upper ones, too small to share, as one range: bodies go through it backwards.
         top = int(np.searchsorted(levels, GRAIN, "right")) - 1
         self._start = np.concatenate([[0], levels[max(top, 1) :]])
         self.refit(x)
 
-    def refit(self, x: np.ndarray, y: np.ndarray | None = None, margin: float | np.ndarray = 0.0) -> None:
+    def refit(
+        self,
+        x: np.ndarray,
+        y: np.ndarray | None = None,
+        margin: float | np.ndarray = 0.0,
+        way: np.ndarray | None = None,
+    ) -> None:
         """Fit the boxes to positions x (n_vert, 3) [m], or to both x and y.
 
         Each vertex counts as a cube of half the edge ``margin`` [m], one for all or (n_vert,): as far as it may go.
-        Queries look for what is so much farther away.
+        Queries look for what is so much farther away; and, where ways (n_vert, 3) [m] are given, by how far it is
+        expected to go relative to who asks.
         """
         x = np.ascontiguousarray(x, np.float64)
-        y = x if y is None else np.ascontiguousarray(y, np.float64)
+        self._fit(self.boxes, x, x if y is None else np.ascontiguousarray(y, np.float64), margin)
+        self.way = way
+        if way is not None:
+            self.way = np.ascontiguousarray(way, np.float64)
+            self._fit(self.ways, self.way, self.way, 0.0)
+
+    def _fit(self, boxes: np.ndarray, x: np.ndarray, y: np.ndarray, margin: float | np.ndarray) -> None:
         assert x.shape[1:] == y.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
         assert min(len(x), len(y)) >= self.n_vert, "a vertex has no position"
-        self.margin = np.array(np.broadcast_to(np.asarray(margin, np.float64), len(x)))
+        margin = np.array(np.broadcast_to(np.asarray(margin, np.float64), len(x)))
         numbers = np.array([self.cells.shape[1], y is not x], np.int64)
-        arrays = (self.nodes, self.boxes, self.sorted_cells.ravel(), x, y, numbers, self.margin)
+        arrays = (self.nodes, boxes, self.sorted_cells.ravel(), x, y, numbers, margin)
         run(_refit, arrays, np.arange(len(self._start) - 1)[::-1].copy(), self._start, GRAIN)
+        if boxes is self.boxes:
+            self.margin = margin
 
 
 @body
 def _refit(arguments, low, high):
-    """Body of :meth:`BoxTree.refit` for nodes low .. high, whose children are done or among them."""
+    """Body of :meth:`BoxTree._fit` for nodes low .. high, whose children are done or among them."""
     nodes, boxes = rows(arguments, 0, 4, np.int32), rows(arguments, 1, 6, np.float64)
     cells, x, y = array(arguments, 2, np.int32), rows(arguments, 3, 3, np.float64), rows(arguments, 4, 3, np.float64)
     k, swept = array(arguments, 5, np.int64)[0], array(arguments, 5, np.int64)[1]

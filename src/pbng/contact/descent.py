@@ -11,7 +11,8 @@ from pbng.contact.bvh import DEPTH
 from pbng.jit import inline
 
 STARTS = 48  # nodes from which these go on by themselves, at most
-CORNERS = 6 * STARTS
+CORNERS = 12 * STARTS
+LARGEST = 1e300  # squared distance above all that count, but not infinite as of what is out of reach
 STACK = DEPTH + STARTS  # nodes that wait their turn
 ROUNDING = 1e-14  # distances that differ by less, relative to themselves or to the size of the tree, are the same
 
@@ -86,25 +87,42 @@ def common_ground(reach, own, n_group, grouped, first, last):
 
 
 @inline
-def find_starts(nodes, boxes, meets, row, low, high, reach, starts, corners, stack):
-    """Nodes with all that is no farther than ``reach`` from a box, and how many; a row of -1 is that of many groups.
+def limit2(moving, ways, i, reach, low, high):
+    """Squared distance up to which what goes as far as from low to high looks for node i, ``reach`` if all rests.
 
-    Without a bound there is only the root: from there near nodes come first. ``corners`` are those of their boxes, one
-    coordinate after the other.
+    The farther, the more their ways differ.
     """
-    within = reach * reach
+    if not moving:
+        return reach * reach
+    dx = max(high[0] - ways[i, 0], ways[i, 3] - low[0])
+    dy = max(high[1] - ways[i, 1], ways[i, 4] - low[1])
+    dz = max(high[2] - ways[i, 2], ways[i, 5] - low[2])
+    return squared(reach + sqrt(dx * dx + dy * dy + dz * dz))
+
+
+@inline
+def find_starts(nodes, boxes, moving, ways, meets, row, low, high, reach, w_low, w_high, starts, corners, stack):
+    """Nodes with all that is within reach of a box, and how many; a row of -1 is that of many groups.
+
+    Without a bound there is only the root: from there near nodes come first. ``corners`` are those of their boxes and
+    of their ways, one coordinate after the other; w_low and w_high those of the ways of what is in the box.
+    """
     n, top = 0, 1
     stack[0] = 0
     while top > 0:
         top -= 1
         i = stack[top]
-        if gap2(boxes, i, low, high) > within or (row >= 0 and nodes[i, 3] >= 0 and not meets[row + nodes[i, 3]]):
+        if gap2(boxes, i, low, high) > limit2(moving, ways, i, reach, w_low, w_high):
+            continue
+        if row >= 0 and nodes[i, 3] >= 0 and not meets[row + nodes[i, 3]]:
             continue
         child = nodes[i, 0]
         if child < 0 or n + top + 2 > STARTS or reach == np.inf:
             starts[n] = i
             for j in range(6):
                 corners[j * STARTS + n] = boxes[i, j]
+                if moving:
+                    corners[(6 + j) * STARTS + n] = ways[i, j]
             n += 1
         else:
             stack[top], stack[top + 1] = child + 1, child
@@ -113,18 +131,24 @@ def find_starts(nodes, boxes, meets, row, low, high, reach, starts, corners, sta
 
 
 @inline
-def begin(starts, corners, n, low, high, within, stack, gaps):
-    """Put those starts on the stack that are no farther than √within from a box; how many."""
+def begin(starts, corners, n, moving, low, high, reach, w_low, w_high, stack, gaps):
+    """Put those starts on the stack that are within reach of a box, whose ways are from w_low to w_high; how many."""
     for s in range(n):
         dx = max(corners[s] - high[0], 0.0, low[0] - corners[3 * STARTS + s])
         dy = max(corners[STARTS + s] - high[1], 0.0, low[1] - corners[4 * STARTS + s])
         dz = max(corners[2 * STARTS + s] - high[2], 0.0, low[2] - corners[5 * STARTS + s])
-        gaps[s] = dx * dx + dy * dy + dz * dz
+        gap, limit = dx * dx + dy * dy + dz * dz, reach * reach
+        if moving:
+            dx = max(w_high[0] - corners[6 * STARTS + s], corners[9 * STARTS + s] - w_low[0])
+            dy = max(w_high[1] - corners[7 * STARTS + s], corners[10 * STARTS + s] - w_low[1])
+            dz = max(w_high[2] - corners[8 * STARTS + s], corners[11 * STARTS + s] - w_low[2])
+            limit = squared(reach + sqrt(dx * dx + dy * dy + dz * dz))
+        gaps[s] = gap if gap <= limit else np.inf
     top = 0
     for s in range(n):
         gap = gaps[s]
         stack[top], gaps[top] = starts[s], gap
-        top += 1 if gap <= within else 0
+        top += 1 if gap < np.inf else 0
     return top
 
 
@@ -154,10 +178,11 @@ def put_nearest_on_top(stack, gaps, top):
 
 
 @inline
-def next_leaf(nodes, boxes, meets, row, low, high, within, stack, gaps, top):
+def next_leaf(nodes, boxes, moving, ways, meets, row, low, high, reach, w_low, w_high, within, stack, gaps, top):
     """The next leaf on the way, -1 for none, and how many nodes are left on the stack with their squared distances.
 
-    Of nodes that the groups of ``row`` meet, near ones first; none whose box is farther than √within from a box.
+    Of nodes that the groups of ``row`` meet, near ones first; none whose box is farther than √within from a box, or out
+    of its reach.
     """
     while top > 0:
         top -= 1
@@ -167,6 +192,8 @@ def next_leaf(nodes, boxes, meets, row, low, high, within, stack, gaps, top):
             if child < 0:
                 return i, top
             near, far = gap2(boxes, child, low, high), gap2(boxes, child + 1, low, high)
+            near = near if near <= limit2(moving, ways, child, reach, w_low, w_high) else np.inf
+            far = far if far <= limit2(moving, ways, child + 1, reach, w_low, w_high) else np.inf
             i, child = child, child + 1
             if far < near:
                 i, child, near, far = child, i, far, near

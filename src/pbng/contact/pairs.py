@@ -27,7 +27,8 @@ from pbng.linalg import add, combine, cross, dot, point, scale, sub, unit
 from pbng.parallel import array, body, each, rows
 from pbng.topology import edge_sides
 
-FARTHER = 1.5  # than it is expected to go may a vertex go in a step with inertia
+STRAY = 0.5  # of its way may a vertex stray from where it is expected to go in a step with inertia: two, if one stops
+BRISK = 0.25  # of how far is looked must vertices go for it to pay to look how they go relative to each other
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
 ASIDE = 0.5  # cosine of the angle between two parts of a solid's surface below which they may face each other
 ROOM = 1e-6  # of the distance that is kept, by which surfaces at rest may be too close
@@ -57,7 +58,7 @@ class SurfaceDetector:
         tell = Sides(self.normals, start, sides)
         self.insides = Insides(s, X, self.vertex, self.body, self.triangles, self.normals, tell)
         self.solid = self.insides.solid
-        self.facing = 1.0 * self.solid[self.insides.own][:, None]  # cloth faces both ways
+        self.one_sided = bool((s.own & self.solid).any())  # what may touch itself; cloth faces both ways
         self.edges, self.beside = self._sharp_edges(edges, start, sides)
         self.edge_ends = np.ascontiguousarray(self.edges.T)
         self.edge_body = self.body[self.edge_ends[0]]
@@ -116,13 +117,15 @@ class SurfaceDetector:
         """
         s = self.surfaces
         x0 = np.ascontiguousarray(x0, float)
-        moved = norms(x1 - x0)
-        radius = self.radius + min(ahead, AHEAD * self.radius)
+        margin, way, skin = norms(x1 - x0), None, 2 * float(s.skin.max(initial=0.0))
+        radius = self.radius + min(ahead, AHEAD * self.radius) + skin
         if dt is not None and s.radius is None:
-            radius, moved = CLOSE / NEAR * self.radius, FARTHER * moved
-        reach = radius + 2 * float(s.skin.max(initial=0.0)) + moved
+            radius = CLOSE / NEAR * self.radius + skin
+            brisk = margin[self.vertex].mean() > BRISK * radius
+            margin, way = (STRAY * margin, x1 - x0) if brisk else ((1 + STRAY) * margin, None)
+        reach = radius + margin
         self.normals.fit(x0)
-        self.triangles.refit(x0, margin=moved)
+        self.triangles.refit(x0, margin=margin, way=way)
         pairs, own_edges = [], np.empty(0, np.int64)
         if self.several:
             pairs.append(self._vertex_triangle(x0, reach, self.meets_others, None))
@@ -132,7 +135,7 @@ class SurfaceDetector:
             seen[pairs[-1].vertices] = True
             own_edges = np.flatnonzero(seen[self.edge_ends[0]] | seen[self.edge_ends[1]])
         if self.several or len(own_edges):
-            self.edge_tree.refit(x0, margin=moved)
+            self.edge_tree.refit(x0, margin=margin, way=way)
         if self.several:
             pairs.append(self._edge_edge(x0, slice(None), reach, self.meets_later, None))
         if len(own_edges):
@@ -145,8 +148,10 @@ class SurfaceDetector:
     def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Spans | None) -> Pairs:
         vertex, reach = self.vertex, reach[self.vertex]
         asked: dict[str, Any] = {"own": self.insides.own, "meets": meets, "vertex": vertex, "excluded": excluded}
-        if excluded is not None:
-            asked |= {"against": self.normals.around_vertices(vertex) * self.facing, "limit": ASIDE}
+        if excluded is not None and self.one_sided:
+            against = self.normals.around_vertices(vertex)
+            against[~self.solid[self.insides.own]] = 0.0
+            asked |= {"against": against, "limit": ASIDE}
         closest = closest_triangles(self.triangles, x, x[vertex], reach, **asked)
         triangle, weights, inside = self.insides.touched(x, closest, reach, meets, excluded)
         found = np.flatnonzero(triangle >= 0)

@@ -17,6 +17,7 @@ import numpy as np
 from pbng.contact.bvh import DEPTH, BoxTree
 from pbng.contact.descent import (
     CORNERS,
+    LARGEST,
     STACK,
     STARTS,
     begin,
@@ -35,7 +36,7 @@ from pbng.contact.descent import (
 )
 from pbng.contact.primitives import closest_on_triangle, closest_segments, tet_weights
 from pbng.contact.rings import Spans
-from pbng.linalg import cross, dot, point, sub
+from pbng.linalg import combine, combine3, cross, dot, point, sub
 from pbng.parallel import array, body, each, rows, scratch
 
 GRAIN = 128  # queries that a thread takes at a time
@@ -64,7 +65,8 @@ def closest_triangles(
         x: Positions (n_vert, 3) [m].
         points: Points (k, 3) [m].
         reach: How far to look [m], a number or one a point (k,), to which what is looked at adds the largest margin
-            of its vertices (:meth:`pbng.contact.bvh.BoxTree.refit`); below 0 a point is not asked.
+            of its vertices, and how far it is expected to go relative to the point, which rests unless it is a vertex
+            (:meth:`pbng.contact.bvh.BoxTree.refit`); below 0 a point is not asked.
         own, meets, vertex, excluded: What may be found, see above.
         behind: Find only triangles that the point is behind: (point - closest point) · normal < 0.
         against: Directions (k, 3): find only triangles whose normals do not point along them, all where one is zero.
@@ -78,7 +80,7 @@ def closest_triangles(
     assert excluded is None or vertex is not None, "excluded needs vertex"
     k = len(points)
     found, weights, distance = np.empty(k, np.int32), np.empty((k, 3)), np.empty(k)
-    flags = np.array([behind, against is not None], np.int64)
+    flags = np.array([behind, against is not None, vertex is not None], np.int64)
     against = np.zeros((1, 3)) if against is None else np.ascontiguousarray(against, np.float64)
     arrays = (points, flags, found, weights, distance, against, np.array([limit * limit]))
     each(_closest_triangles, (*_common(tree, 3, x, k, reach, own, meets, vertex, excluded), *arrays), k, GRAIN)
@@ -102,7 +104,7 @@ def closest_edges(
         x: Positions (n_vert, 3) [m].
         edges: Vertices (k, 2) of the edges that ask.
         reach: How far to look [m], a number or one an edge (k,), to which what is looked at adds the larger margin of
-            its vertices; below 0 an edge is not asked.
+            its vertices, and how far it is expected to go relative to the edge; below 0 an edge is not asked.
         own, meets, excluded: What may be found, see above; what either vertex excludes is excluded.
 
     Returns:
@@ -163,7 +165,7 @@ def _common(
     vertex: np.ndarray | None,
     excluded: Spans | None,
 ) -> tuple[np.ndarray, ...]:
-    """The first 14 arguments of every body; what does not fit is refused here, as bodies read without looking."""
+    """The first 16 arguments of every body; what does not fit is refused here, as bodies read without looking."""
     assert tree.cells.shape[1] == corners, f"a tree over primitives of {corners} vertices is needed"
     x = np.ascontiguousarray(x, np.float64)
     assert x.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
@@ -180,9 +182,10 @@ def _common(
         Spans(np.zeros(1, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)) if excluded is None else excluded
     )
     vertex = _numbers(vertex, k, NONE if excluded is None else len(listed.start) - 1)
-    sizes = np.array([grouped, meets.shape[1], excluded is not None], np.int64)
+    way = np.zeros((1, 3)) if tree.way is None else tree.way
+    sizes = np.array([grouped, meets.shape[1], excluded is not None, tree.way is not None], np.int64)
     asked = reaches, sizes, meets, own, vertex, *listed
-    return tree.nodes, tree.boxes, tree.order, tree.sorted_cells, x, *asked, tree.margin
+    return tree.nodes, tree.boxes, tree.order, tree.sorted_cells, x, *asked, tree.margin, tree.ways, way
 
 
 def _numbers(a: np.ndarray | None, k: int, end: int) -> np.ndarray:
@@ -205,11 +208,13 @@ def _closest_triangles(arguments, low, high):
     own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
     start, first, past = array(arguments, 10, np.int64), array(arguments, 11, np.int32), array(arguments, 12, np.int32)
     margin = array(arguments, 13, np.float64)
-    points, behind = rows(arguments, 14, 3, np.float64), array(arguments, 15, np.int64)[0]
-    directed, against = array(arguments, 15, np.int64)[1], rows(arguments, 19, 3, np.float64)
-    found, weights = array(arguments, 16, np.int32), rows(arguments, 17, 3, np.float64)
-    distance, limit2 = array(arguments, 18, np.float64), array(arguments, 20, np.float64)[0]
-    grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
+    points, behind = rows(arguments, 16, 3, np.float64), array(arguments, 17, np.int64)[0]
+    directed, named = array(arguments, 17, np.int64)[1], array(arguments, 17, np.int64)[2]
+    against = rows(arguments, 21, 3, np.float64)
+    found, weights = array(arguments, 18, np.int32), rows(arguments, 19, 3, np.float64)
+    distance, limit2 = array(arguments, 20, np.float64), array(arguments, 22, np.float64)[0]
+    grouped, n_group, listed, moving = sizes[0], sizes[1], sizes[2], sizes[3]
+    ways, way = rows(arguments, 14, 6, np.float64), rows(arguments, 15, 3, np.float64)
     stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
     starts, corners = scratch(STARTS, np.int32), scratch(CORNERS, np.float64)
     slack = slack_of(boxes)
@@ -217,13 +222,19 @@ def _closest_triangles(arguments, low, high):
     for q in range(low, high):
         if (q - low) % BUNCH == 0:
             lowest, highest, last = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf), min(q + BUNCH, high)
+            w_low, w_high = lowest, highest
             for j in range(q, last):
                 if reach[j] >= 0.0:
                     p = point(points, j)
                     lowest, highest = lower_corner(lowest, p), upper_corner(highest, p)
+                    mine = point(way, vertex[j]) if moving and named else (0.0, 0.0, 0.0)
+                    w_low, w_high = lower_corner(w_low, mine), upper_corner(w_high, mine)
             farthest, together = common_ground(reach, own, n_group, grouped, q, last)
             if farthest >= 0.0:
-                n_start = find_starts(nodes, boxes, meets, together, lowest, highest, farthest, starts, corners, stack)
+                n_start = find_starts(
+                    nodes, boxes, moving, ways, meets, together, lowest, highest, farthest, w_low, w_high, starts,
+                    corners, stack,
+                )  # fmt: skip
         found[q], distance[q] = -1, np.inf
         weights[q, 0] = weights[q, 1] = weights[q, 2] = 0.0
         if not reach[q] >= 0.0:
@@ -233,14 +244,17 @@ def _closest_triangles(arguments, low, high):
         closest = NONE
         u = v = w = 0.0
         best = least = most = np.inf
-        within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
-        top = begin(starts, corners, n_start, p, p, within, stack, gaps)
+        within = LARGEST  # of boxes worth a look
+        mine = point(way, vertex[q]) if moving and named else (0.0, 0.0, 0.0)
+        top = begin(starts, corners, n_start, moving, p, p, reach[q], mine, mine, stack, gaps)
         if listed:
             top = leave_out(nodes, start, first, past, vertex[q], stack, gaps, top)
         put_nearest_on_top(stack, gaps, top)
         end = start[vertex[q] + 1] if listed else 0
         while True:
-            i, top = next_leaf(nodes, boxes, meets, row, p, p, within, stack, gaps, top)
+            i, top = next_leaf(
+                nodes, boxes, moving, ways, meets, row, p, p, reach[q], mine, mine, within, stack, gaps, top
+            )
             if i < 0:
                 break
             r = seek(start, past, vertex[q], nodes[i, 1]) if listed else end
@@ -258,7 +272,12 @@ def _closest_triangles(arguments, low, high):
                 weight, offset, d2 = closest_on_triangle(p, a, b, c)
                 if not d2 <= most or (d2 >= least and t > closest):  # not a number is not found
                     continue
-                if d2 > squared(reach[q] + max(margin[cells[e, 0]], margin[cells[e, 1]], margin[cells[e, 2]])):
+                far = reach[q] + max(margin[cells[e, 0]], margin[cells[e, 1]], margin[cells[e, 2]])
+                if moving:
+                    f, g, h = point(way, cells[e, 0]), point(way, cells[e, 1]), point(way, cells[e, 2])
+                    apart = sub(combine3(weight[0], f, weight[1], g, weight[2], h), mine)
+                    far += sqrt(dot(apart, apart))
+                if d2 > squared(far):
                     continue
                 if behind and not dot(offset, n) > 0.0:
                     continue
@@ -280,10 +299,11 @@ def _closest_edges(arguments, low, high):
     own, start = array(arguments, 8, np.int32), array(arguments, 10, np.int64)
     first, past = array(arguments, 11, np.int32), array(arguments, 12, np.int32)
     margin = array(arguments, 13, np.float64)
-    edges, found = rows(arguments, 14, 2, np.int32), array(arguments, 15, np.int32)
-    s, t = array(arguments, 16, np.float64), array(arguments, 17, np.float64)
-    distance = array(arguments, 18, np.float64)
-    grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
+    edges, found = rows(arguments, 16, 2, np.int32), array(arguments, 17, np.int32)
+    s, t = array(arguments, 18, np.float64), array(arguments, 19, np.float64)
+    distance = array(arguments, 20, np.float64)
+    grouped, n_group, listed, moving = sizes[0], sizes[1], sizes[2], sizes[3]
+    ways, way = rows(arguments, 14, 6, np.float64), rows(arguments, 15, 3, np.float64)
     stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
     starts, corners = scratch(STARTS, np.int32), scratch(CORNERS, np.float64)
     slack = slack_of(boxes)
@@ -291,6 +311,7 @@ def _closest_edges(arguments, low, high):
     for q in range(low, high):
         if (q - low) % BUNCH == 0:
             lowest, highest, last = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf), min(q + BUNCH, high)
+            w_low, w_high = lowest, highest
             for j in range(q, last):
                 if reach[j] >= 0.0:
                     a, b = point(x, edges[j, 0]), point(x, edges[j, 1])
@@ -298,9 +319,16 @@ def _closest_edges(arguments, low, high):
                         lower_corner(lowest, lower_corner(a, b)),
                         upper_corner(highest, upper_corner(a, b)),
                     )
+                    if moving:
+                        a, b = point(way, edges[j, 0]), point(way, edges[j, 1])
+                        w_low = lower_corner(w_low, lower_corner(a, b))
+                        w_high = upper_corner(w_high, upper_corner(a, b))
             farthest, together = common_ground(reach, own, n_group, grouped, q, last)
             if farthest >= 0.0:
-                n_start = find_starts(nodes, boxes, meets, together, lowest, highest, farthest, starts, corners, stack)
+                n_start = find_starts(
+                    nodes, boxes, moving, ways, meets, together, lowest, highest, farthest, w_low, w_high, starts,
+                    corners, stack,
+                )  # fmt: skip
         found[q], s[q], t[q], distance[q] = -1, 0.0, 0.0, np.inf
         if not reach[q] >= 0.0:
             continue
@@ -311,15 +339,33 @@ def _closest_edges(arguments, low, high):
         closest = NONE
         along, across = 0.0, 0.0
         best = least = most = np.inf
-        within = reach[q] * reach[q]  # of boxes worth a look, which have their margin
-        top = begin(starts, corners, n_start, lowest, highest, within, stack, gaps)
+        within = LARGEST  # of boxes worth a look
+        from_v, from_w = (point(way, v), point(way, w)) if moving else ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        w_low, w_high = lower_corner(from_v, from_w), upper_corner(from_v, from_w)
+        top = begin(starts, corners, n_start, moving, lowest, highest, reach[q], w_low, w_high, stack, gaps)
         if listed:
             top = leave_out(nodes, start, first, past, v, stack, gaps, top)
             top = leave_out(nodes, start, first, past, w, stack, gaps, top)
         put_nearest_on_top(stack, gaps, top)
         r_end, h_end = (start[v + 1], start[w + 1]) if listed else (0, 0)
         while True:
-            i, top = next_leaf(nodes, boxes, meets, row, lowest, highest, within, stack, gaps, top)
+            i, top = next_leaf(
+                nodes,
+                boxes,
+                moving,
+                ways,
+                meets,
+                row,
+                lowest,
+                highest,
+                reach[q],
+                w_low,
+                w_high,
+                within,
+                stack,
+                gaps,
+                top,
+            )
             if i < 0:
                 break
             r = seek(start, past, v, nodes[i, 1]) if listed else r_end
@@ -336,7 +382,13 @@ def _closest_edges(arguments, low, high):
                 s1, t1, _, d2 = closest_segments(a, b, point(x, c), point(x, d))
                 if not d2 <= most or (d2 >= least and edge > closest):
                     continue
-                if d2 > squared(reach[q] + max(margin[c], margin[d])):
+                far = reach[q] + max(margin[c], margin[d])
+                if moving:
+                    apart = sub(
+                        combine(1.0 - s1, from_v, s1, from_w), combine(1.0 - t1, point(way, c), t1, point(way, d))
+                    )
+                    far += sqrt(dot(apart, apart))
+                if d2 > squared(far):
                     continue
                 best, closest, along, across = d2, edge, s1, t1
                 least, most = same_as(best, slack)
@@ -353,9 +405,10 @@ def _containing_tets(arguments, low, high):
     reach, sizes, meets = array(arguments, 5, np.float64), array(arguments, 6, np.int64), array(arguments, 7, np.bool_)
     own, vertex = array(arguments, 8, np.int32), array(arguments, 9, np.int32)
     start, first, past = array(arguments, 10, np.int64), array(arguments, 11, np.int32), array(arguments, 12, np.int32)
-    points, named = rows(arguments, 14, 3, np.float64), array(arguments, 15, np.int64)[0]
-    found, weights = array(arguments, 16, np.int32), rows(arguments, 17, 4, np.float64)
-    grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
+    points, named = rows(arguments, 16, 3, np.float64), array(arguments, 17, np.int64)[0]
+    found, weights = array(arguments, 18, np.int32), rows(arguments, 19, 4, np.float64)
+    grouped, n_group, listed, rests, none = sizes[0], sizes[1], sizes[2], False, (0.0, 0.0, 0.0)
+    ways = rows(arguments, 14, 6, np.float64)
     stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
     for q in range(low, high):
         found[q] = -1
@@ -367,7 +420,7 @@ def _containing_tets(arguments, low, high):
         v = vertex[q] if named else -1
         lowest = NONE
         stack[0], gaps[0] = 0, 0.0
-        i, top = next_leaf(nodes, boxes, meets, row, p, p, 0.0, stack, gaps, 1)
+        i, top = next_leaf(nodes, boxes, rests, ways, meets, row, p, p, 0.0, none, none, 0.0, stack, gaps, 1)
         while i >= 0:
             for e in range(nodes[i, 1], nodes[i, 2]):
                 t = order[e]
@@ -381,6 +434,6 @@ def _containing_tets(arguments, low, high):
                     continue
                 lowest = t
                 weights[q, 0], weights[q, 1], weights[q, 2], weights[q, 3] = wa, wb, wc, wd
-            i, top = next_leaf(nodes, boxes, meets, row, p, p, 0.0, stack, gaps, top)
+            i, top = next_leaf(nodes, boxes, rests, ways, meets, row, p, p, 0.0, none, none, 0.0, stack, gaps, top)
         if lowest < NONE:
             found[q] = lowest
