@@ -215,6 +215,64 @@ def test_triangles_that_a_point_is_behind(rng):
     assert (closest_triangles(tree, X, outside, 0.9, behind=True)[0] == -1).all()
 
 
+@pytest.mark.parametrize("limit", [0.0, 0.5])
+def test_triangles_that_face_a_direction(rng, limit):
+    """Of all triangles those are looked at whose normals do not point along a direction; without one, all."""
+    x, triangles = soup(rng, 200)
+    p, against = rng.random((50, 3)), rng.standard_normal((50, 3))
+    against[::10] = 0.0
+    a, b, c = x[triangles].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    triangles, normal = (k[np.linalg.norm(normal, axis=1) > 1e-9] for k in (triangles, normal))
+    along = against @ normal.T
+    bound = limit * np.linalg.norm(against, axis=1)[:, None] * np.linalg.norm(normal, axis=1)
+    every = np.where((along <= 0) | (along < bound), distances(x, triangles, p), np.inf)
+    found, _, distance = closest_triangles(BoxTree(x, triangles), x, p, against=against, limit=limit)
+    np.testing.assert_allclose(distance, every.min(1), atol=1e-12)
+    np.testing.assert_allclose(every[np.arange(50), found], every.min(1), atol=1e-12)
+
+
+def test_what_is_looked_for_farther_away_the_more_it_moves_relatively(rng):
+    """Within reach, plus the margin of a triangle's or edge's vertices, plus how far it goes relative to who asks."""
+    x, triangles = soup(rng, 150)
+    margin, way = 0.05 * rng.random(len(x)), rng.normal(0.1, 0.05, (len(x), 3))
+    vertex = np.arange(0, len(x), 3)
+    reach = 0.1 * rng.random(len(vertex))
+    tree = BoxTree(x, triangles)
+    tree.refit(x, margin=margin, way=way)
+    mine = spans(tree.order, *neighbourhoods(triangles, len(x), 1))
+    found, _, distance = closest_triangles(tree, x, x[vertex], reach, vertex=vertex, excluded=mine)
+    alone = [closest_triangles(BoxTree(x, t[None]), x, x[vertex], vertex=vertex) for t in triangles]
+    for k in range(len(vertex)):
+        d = np.array([a[2][k] for a in alone])
+        theirs = np.array([a[1][k] @ way[t] for a, t in zip(alone, triangles)])
+        limit = reach[k] + margin[triangles].max(1) + np.linalg.norm(theirs - way[vertex[k]], axis=1)
+        d[(d > limit) | (triangles == vertex[k]).any(1)] = np.inf
+        assert distance[k] == pytest.approx(d.min())
+        assert found[k] == (d.argmin() if np.isfinite(d.min()) else -1)
+    assert 10 < (found < 0).sum() < len(vertex) - 10
+    resting = closest_triangles(tree, x, x[vertex], reach)[0]  # points that are no vertices are at rest
+    assert (resting != found).any()
+
+    x, edges = edge_soup(rng)
+    margin, way = 0.01 * rng.random(len(x)), rng.normal(0.1, 0.005, (len(x), 3))
+    reach = 0.02 * rng.random(len(edges))
+    tree = BoxTree(x, edges)
+    tree.refit(x, margin=margin, way=way)
+    found, _, _, distance = closest_edges(tree, x, edges, reach)
+    for k, (v, w) in enumerate(edges):
+        d = np.full(len(edges), np.inf)
+        for e, (a, b) in enumerate(edges):
+            if e == k:
+                continue
+            _, s, t, (gap,) = (q for q in closest_edges(BoxTree(x, edges[e : e + 1]), x, edges[k : k + 1]))
+            apart = (1 - s) * way[v] + s * way[w] - (1 - t) * way[a] - t * way[b]
+            if gap <= reach[k] + max(margin[a], margin[b]) + np.linalg.norm(apart):
+                d[e] = gap
+        assert distance[k] == pytest.approx(d.min(), abs=1e-12)
+    assert 10 < (found < 0).sum() < len(edges) - 10
+
+
 def edge_soup(rng, n=120):
     x = rng.random((2 * n, 3))
     edges = np.arange(2 * n, dtype=np.int32).reshape(-1, 2)
