@@ -10,6 +10,7 @@ from pbng import Rotate, Scale, Translate
 from pbng.contact.collider import Collider
 from pbng.contact.colliders import Box, Capsule, Plane, Sphere, container
 from pbng.contact.kinematic import Kinematic
+from pbng.contact.touching import Shapes
 
 SHAPES: dict[str, Collider] = {
     "plane": Plane((0.1, 0.2, 0.3), (1.0, 2.0, -0.5)),
@@ -330,6 +331,22 @@ def test_whoever_else_is_asked_about(name, motion):
             assert np.allclose(alone.normal, normal, atol=1e-13)
             found += 1
     assert found == len(every.vertex)
+
+
+def test_shapes_asked_together():
+    """Of each shape the same as if it were alone, whether it rests, moves or turns."""
+    motions = {"plane": None, "sphere": MOTION, "capsule": Rotate("x", 2.0), "box": None}
+    shapes = [replace(SHAPES[name], motion=motion, over=1.0) for name, motion in motions.items()]
+    before = points(500, 23)
+    after = before + 0.3 * points(500, 24)
+    which, together = Shapes(shapes).touch(before, after, 0.1, 0.2, 0.05)
+    assert (np.diff(which) >= 0).all()
+    for k, shape in enumerate(shapes):
+        alone = shape.touch(before, after, 0.1, 0.2, 0.05)
+        assert len(alone.vertex) > 20
+        for a, b in zip(together, alone):
+            assert np.array_equal(a[which == k], b)
+    assert len(Shapes([]).touch(before, after, 0.1, 0.2, 0.05)[0]) == 0
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -1,6 +1,9 @@
 """How queries go down a tree of boxes, near nodes first, and what they pass by: pieces of the bodies of queries.
 
 Near queries begin together: what lies within reach of their common box is found once, and each goes on from there.
+
+``tree`` is (nodes, boxes, ways, whether these count), as of :class:`pbng.contact.bvh.BoxTree`. ``who`` asks: the lowest
+and the highest corner of a box, and those of a box about its ways.
 """
 
 from math import sqrt
@@ -87,11 +90,10 @@ def common_ground(reach, own, n_group, grouped, first, last):
 
 
 @inline
-def limit2(moving, ways, i, reach, low, high):
-    """Squared distance up to which what goes as far as from low to high looks for node i, ``reach`` if all rests.
-
-    The farther, the more their ways differ.
-    """
+def limit2(tree, i, who, reach):
+    """Squared distance up to which node i is looked at: the farther, the more its ways differ from who asks."""
+    _, _, ways, moving = tree
+    _, _, low, high = who
     if not moving:
         return reach * reach
     dx = max(high[0] - ways[i, 0], ways[i, 3] - low[0])
@@ -101,18 +103,19 @@ def limit2(moving, ways, i, reach, low, high):
 
 
 @inline
-def find_starts(nodes, boxes, moving, ways, meets, row, low, high, reach, w_low, w_high, starts, corners, stack):
-    """Nodes with all that is within reach of a box, and how many; a row of -1 is that of many groups.
+def find_starts(tree, meets, row, who, reach, starts, corners, stack):
+    """Nodes with all that is within reach, and how many; a row of -1 is that of many groups.
 
     Without a bound there is only the root: from there near nodes come first. ``corners`` are those of their boxes and
-    of their ways, one coordinate after the other; w_low and w_high those of the ways of what is in the box.
+    of their ways, one coordinate after the other.
     """
+    nodes, boxes, ways, moving = tree
     n, top = 0, 1
     stack[0] = 0
     while top > 0:
         top -= 1
         i = stack[top]
-        if gap2(boxes, i, low, high) > limit2(moving, ways, i, reach, w_low, w_high):
+        if gap2(boxes, i, who[0], who[1]) > limit2(tree, i, who, reach):
             continue
         if row >= 0 and nodes[i, 3] >= 0 and not meets[row + nodes[i, 3]]:
             continue
@@ -131,8 +134,9 @@ def find_starts(nodes, boxes, moving, ways, meets, row, low, high, reach, w_low,
 
 
 @inline
-def begin(starts, corners, n, moving, low, high, reach, w_low, w_high, stack, gaps):
-    """Put those starts on the stack that are within reach of a box, whose ways are from w_low to w_high; how many."""
+def begin(moving, starts, corners, n, who, reach, stack, gaps):
+    """Put those starts on the stack that are within reach; how many."""
+    low, high, w_low, w_high = who
     for s in range(n):
         dx = max(corners[s] - high[0], 0.0, low[0] - corners[3 * STARTS + s])
         dy = max(corners[STARTS + s] - high[1], 0.0, low[1] - corners[4 * STARTS + s])
@@ -178,12 +182,12 @@ def put_nearest_on_top(stack, gaps, top):
 
 
 @inline
-def next_leaf(nodes, boxes, moving, ways, meets, row, low, high, reach, w_low, w_high, within, stack, gaps, top):
+def next_leaf(tree, meets, row, who, reach, within, stack, gaps, top):
     """The next leaf on the way, -1 for none, and how many nodes are left on the stack with their squared distances.
 
-    Of nodes that the groups of ``row`` meet, near ones first; none whose box is farther than √within from a box, or out
-    of its reach.
+    Of nodes that the groups of ``row`` meet, near ones first; none that is farther away than √within, or out of reach.
     """
+    nodes, boxes, _, _ = tree
     while top > 0:
         top -= 1
         i, gap = stack[top], gaps[top]
@@ -191,9 +195,9 @@ def next_leaf(nodes, boxes, moving, ways, meets, row, low, high, reach, w_low, w
             child = nodes[i, 0]
             if child < 0:
                 return i, top
-            near, far = gap2(boxes, child, low, high), gap2(boxes, child + 1, low, high)
-            near = near if near <= limit2(moving, ways, child, reach, w_low, w_high) else np.inf
-            far = far if far <= limit2(moving, ways, child + 1, reach, w_low, w_high) else np.inf
+            near, far = gap2(boxes, child, who[0], who[1]), gap2(boxes, child + 1, who[0], who[1])
+            near = near if near <= limit2(tree, child, who, reach) else np.inf
+            far = far if far <= limit2(tree, child + 1, who, reach) else np.inf
             i, child = child, child + 1
             if far < near:
                 i, child, near, far = child, i, far, near

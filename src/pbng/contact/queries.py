@@ -212,9 +212,9 @@ def _closest_triangles(arguments, low, high):
     directed, named = array(arguments, 17, np.int64)[1], array(arguments, 17, np.int64)[2]
     against = rows(arguments, 21, 3, np.float64)
     found, weights = array(arguments, 18, np.int32), rows(arguments, 19, 3, np.float64)
-    distance, limit2 = array(arguments, 20, np.float64), array(arguments, 22, np.float64)[0]
+    distance, cosine2 = array(arguments, 20, np.float64), array(arguments, 22, np.float64)[0]
     grouped, n_group, listed, moving = sizes[0], sizes[1], sizes[2], sizes[3]
-    ways, way = rows(arguments, 14, 6, np.float64), rows(arguments, 15, 3, np.float64)
+    tree, way = (nodes, boxes, rows(arguments, 14, 6, np.float64), moving), rows(arguments, 15, 3, np.float64)
     stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
     starts, corners = scratch(STARTS, np.int32), scratch(CORNERS, np.float64)
     slack = slack_of(boxes)
@@ -231,10 +231,8 @@ def _closest_triangles(arguments, low, high):
                     w_low, w_high = lower_corner(w_low, mine), upper_corner(w_high, mine)
             farthest, together = common_ground(reach, own, n_group, grouped, q, last)
             if farthest >= 0.0:
-                n_start = find_starts(
-                    nodes, boxes, moving, ways, meets, together, lowest, highest, farthest, w_low, w_high, starts,
-                    corners, stack,
-                )  # fmt: skip
+                who = lowest, highest, w_low, w_high
+                n_start = find_starts(tree, meets, together, who, farthest, starts, corners, stack)
         found[q], distance[q] = -1, np.inf
         weights[q, 0] = weights[q, 1] = weights[q, 2] = 0.0
         if not reach[q] >= 0.0:
@@ -246,15 +244,14 @@ def _closest_triangles(arguments, low, high):
         best = least = most = np.inf
         within = LARGEST  # of boxes worth a look
         mine = point(way, vertex[q]) if moving and named else (0.0, 0.0, 0.0)
-        top = begin(starts, corners, n_start, moving, p, p, reach[q], mine, mine, stack, gaps)
+        who = p, p, mine, mine
+        top = begin(moving, starts, corners, n_start, who, reach[q], stack, gaps)
         if listed:
             top = leave_out(nodes, start, first, past, vertex[q], stack, gaps, top)
         put_nearest_on_top(stack, gaps, top)
         end = start[vertex[q] + 1] if listed else 0
         while True:
-            i, top = next_leaf(
-                nodes, boxes, moving, ways, meets, row, p, p, reach[q], mine, mine, within, stack, gaps, top
-            )
+            i, top = next_leaf(tree, meets, row, who, reach[q], within, stack, gaps, top)
             if i < 0:
                 break
             r = seek(start, past, vertex[q], nodes[i, 1]) if listed else end
@@ -267,7 +264,7 @@ def _closest_triangles(arguments, low, high):
                 n = cross(sub(b, a), sub(c, a)) if directed or behind else p
                 if directed:
                     along = dot(point(against, q), n)
-                    if along > 0.0 and along * along > limit2 * dot(n, n) * dot(point(against, q), point(against, q)):
+                    if along > 0.0 and along * along > cosine2 * dot(n, n) * dot(point(against, q), point(against, q)):
                         continue
                 weight, offset, d2 = closest_on_triangle(p, a, b, c)
                 if not d2 <= most or (d2 >= least and t > closest):  # not a number is not found
@@ -303,7 +300,7 @@ def _closest_edges(arguments, low, high):
     s, t = array(arguments, 18, np.float64), array(arguments, 19, np.float64)
     distance = array(arguments, 20, np.float64)
     grouped, n_group, listed, moving = sizes[0], sizes[1], sizes[2], sizes[3]
-    ways, way = rows(arguments, 14, 6, np.float64), rows(arguments, 15, 3, np.float64)
+    tree, way = (nodes, boxes, rows(arguments, 14, 6, np.float64), moving), rows(arguments, 15, 3, np.float64)
     stack, gaps = scratch(STACK, np.int32), scratch(STACK, np.float64)
     starts, corners = scratch(STARTS, np.int32), scratch(CORNERS, np.float64)
     slack = slack_of(boxes)
@@ -325,10 +322,8 @@ def _closest_edges(arguments, low, high):
                         w_high = upper_corner(w_high, upper_corner(a, b))
             farthest, together = common_ground(reach, own, n_group, grouped, q, last)
             if farthest >= 0.0:
-                n_start = find_starts(
-                    nodes, boxes, moving, ways, meets, together, lowest, highest, farthest, w_low, w_high, starts,
-                    corners, stack,
-                )  # fmt: skip
+                who = lowest, highest, w_low, w_high
+                n_start = find_starts(tree, meets, together, who, farthest, starts, corners, stack)
         found[q], s[q], t[q], distance[q] = -1, 0.0, 0.0, np.inf
         if not reach[q] >= 0.0:
             continue
@@ -341,31 +336,15 @@ def _closest_edges(arguments, low, high):
         best = least = most = np.inf
         within = LARGEST  # of boxes worth a look
         from_v, from_w = (point(way, v), point(way, w)) if moving else ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        w_low, w_high = lower_corner(from_v, from_w), upper_corner(from_v, from_w)
-        top = begin(starts, corners, n_start, moving, lowest, highest, reach[q], w_low, w_high, stack, gaps)
+        who = lowest, highest, lower_corner(from_v, from_w), upper_corner(from_v, from_w)
+        top = begin(moving, starts, corners, n_start, who, reach[q], stack, gaps)
         if listed:
             top = leave_out(nodes, start, first, past, v, stack, gaps, top)
             top = leave_out(nodes, start, first, past, w, stack, gaps, top)
         put_nearest_on_top(stack, gaps, top)
         r_end, h_end = (start[v + 1], start[w + 1]) if listed else (0, 0)
         while True:
-            i, top = next_leaf(
-                nodes,
-                boxes,
-                moving,
-                ways,
-                meets,
-                row,
-                lowest,
-                highest,
-                reach[q],
-                w_low,
-                w_high,
-                within,
-                stack,
-                gaps,
-                top,
-            )
+            i, top = next_leaf(tree, meets, row, who, reach[q], within, stack, gaps, top)
             if i < 0:
                 break
             r = seek(start, past, v, nodes[i, 1]) if listed else r_end
@@ -407,8 +386,8 @@ def _containing_tets(arguments, low, high):
     start, first, past = array(arguments, 10, np.int64), array(arguments, 11, np.int32), array(arguments, 12, np.int32)
     points, named = rows(arguments, 16, 3, np.float64), array(arguments, 17, np.int64)[0]
     found, weights = array(arguments, 18, np.int32), rows(arguments, 19, 4, np.float64)
-    grouped, n_group, listed, rests, none = sizes[0], sizes[1], sizes[2], False, (0.0, 0.0, 0.0)
-    ways = rows(arguments, 14, 6, np.float64)
+    grouped, n_group, listed = sizes[0], sizes[1], sizes[2]
+    tree = nodes, boxes, rows(arguments, 14, 6, np.float64), False
     stack, gaps = scratch(DEPTH, np.int32), scratch(DEPTH, np.float64)
     for q in range(low, high):
         found[q] = -1
@@ -420,7 +399,8 @@ def _containing_tets(arguments, low, high):
         v = vertex[q] if named else -1
         lowest = NONE
         stack[0], gaps[0] = 0, 0.0
-        i, top = next_leaf(nodes, boxes, rests, ways, meets, row, p, p, 0.0, none, none, 0.0, stack, gaps, 1)
+        who = p, p, p, p
+        i, top = next_leaf(tree, meets, row, who, 0.0, 0.0, stack, gaps, 1)
         while i >= 0:
             for e in range(nodes[i, 1], nodes[i, 2]):
                 t = order[e]
@@ -434,6 +414,6 @@ def _containing_tets(arguments, low, high):
                     continue
                 lowest = t
                 weights[q, 0], weights[q, 1], weights[q, 2], weights[q, 3] = wa, wb, wc, wd
-            i, top = next_leaf(nodes, boxes, rests, ways, meets, row, p, p, 0.0, none, none, 0.0, stack, gaps, top)
+            i, top = next_leaf(tree, meets, row, who, 0.0, 0.0, stack, gaps, top)
         if lowest < NONE:
             found[q] = lowest
