@@ -141,6 +141,8 @@ class Collider(ABC):
 
     def poses(self, t0: float, t1: float) -> list[Pose | None]:
         """Poses at t0, perhaps between, and at t1: at even shares of the motion; the same one twice if it rests."""
+        if self.motion is None:
+            return [None, None]
         first, last = self._pose(t0), self._pose(t1)
         s0, s1 = self.share(t0), self.share(t1)
         if last is None or (first is not None and s0 == s1):

@@ -121,7 +121,7 @@ class SurfaceDetector:
         radius = self.radius + min(ahead, AHEAD * self.radius) + skin
         if dt is not None and s.radius is None:
             radius = CLOSE / NEAR * self.radius + skin
-            brisk = margin[self.vertex].mean() > BRISK * radius
+            brisk = margin.mean() > BRISK * radius
             margin, way = (STRAY * margin, x1 - x0) if brisk else ((1 + STRAY) * margin, None)
         reach = radius + margin
         self.normals.fit(x0)
