@@ -11,6 +11,7 @@ from pbng.contact.rings import Spans, neighbourhoods, spans
 from pbng.contact.sides import Sides
 from pbng.contact.spec import CLOSE, Surfaces
 
+NOTHING, SEVERAL = -1, -2  # that a vertex was inside of; several solids, or nobody knows
 SLIPPED = 4.0  # how much closer a triangle must be by which a vertex does not face what it is inside of
 
 
@@ -50,8 +51,8 @@ class Insides:
         self.forget()
 
     def forget(self) -> None:
-        """Of each vertex, whether it was inside a solid of others, and of its own; at first nobody knows."""
-        self.were_inside = [np.ones(len(self.vertex), bool), np.ones(len(self.vertex), bool)]
+        """Of each vertex, which solid of others it was inside of, and whether of its own; at first nobody knows."""
+        self.inside_of = [np.full(len(self.vertex), SEVERAL) for _ in range(2)]
 
     def solids(self, x: np.ndarray, meets: np.ndarray) -> np.ndarray:
         """The solid of others, by ``meets``, whose tets each vertex is in at x (n_vert, 3) [m], (k,); -1 for none."""
@@ -98,8 +99,9 @@ class Insides:
         What the closest point of a whole surface is tells the side. Tets are looked for where it is not known: of the
         own body a part is left out, and of triangles ``far`` out of reach only those are seen that move much. Where
         none is found, they are looked for if the vertex was inside before; what goes in is seen near the surface first.
+        Nor does the closest point tell whether a vertex is still inside of what else it was inside of.
         """
-        s, solid = self.surfaces, np.full(len(triangle), -1, np.int64)
+        s, solid = self.surfaces, np.full(len(triangle), NOTHING)
         known, through = np.zeros(len(triangle), bool), np.zeros(len(triangle), bool)
         if self.tets is None or not (meets & self.solid).any():
             return solid, known, through
@@ -107,21 +109,24 @@ class Insides:
         body, far = s.body[triangle[found]], far[found]
         behind, sure, below = self.sides.behind(x, x[self.vertex[found]], triangle[found], weights[found])
         behind &= self.solid[body]
-        asked = self.were_inside[own].copy()
+        was = self.inside_of[own]
+        asked = was != NOTHING
         if own:
             asked[found[behind]] = True
         else:
             sure &= ~(behind & far)
-            asked[found[sure & self.solid[body]]] = False
+            told = sure & self.solid[body]
+            solid[found[told & behind]] = body[told & behind]
+            asked[found[told & ((was[found] == body) | behind)]] = False
             asked[found[~sure & self.solid[body]]] = True
-            solid[found[behind & sure]] = body[behind & sure]
         q = np.flatnonzero(asked)
         if len(q):
             self.tets.refit(x)
             only = {"own": self.own[q], "meets": meets & self.solid, "excluded": self.near_tets if own else None}
             tet, _ = containing_tets(self.tets, x, x[self.vertex[q]], self.vertex[q], **only)
             solid[q[tet >= 0]] = s.tet_body[tet[tet >= 0]]
-        self.were_inside[own] = solid >= 0
+        elsewhere = (solid != NOTHING) & (was != NOTHING) & (was != solid)
+        self.inside_of[own] = np.where(elsewhere, SEVERAL, solid)
         if own:
             through[found[behind]] = solid[found[behind]] < 0
         known[found] = below & ~far & (solid[found] == body)
