@@ -11,7 +11,7 @@ from pbng.contact.rings import Spans, neighbourhoods, spans
 from pbng.contact.sides import Sides
 from pbng.contact.spec import CLOSE, Surfaces
 
-NOTHING, SEVERAL = -1, -2  # that a vertex was inside of; several solids, or nobody knows
+NOTHING, UNKNOWN, SEVERAL = -1, -2, -3  # solids that a vertex was inside of
 SLIPPED = 4.0  # how much closer a triangle must be by which a vertex does not face what it is inside of
 
 
@@ -52,7 +52,7 @@ class Insides:
 
     def forget(self) -> None:
         """Of each vertex, which solid of others it was inside of, and whether of its own; at first nobody knows."""
-        self.inside_of = [np.full(len(self.vertex), SEVERAL) for _ in range(2)]
+        self.inside_of = [np.full(len(self.vertex), UNKNOWN) for _ in range(2)]
 
     def solids(self, x: np.ndarray, meets: np.ndarray) -> np.ndarray:
         """The solid of others, by ``meets``, whose tets each vertex is in at x (n_vert, 3) [m], (k,); -1 for none."""
@@ -117,7 +117,7 @@ class Insides:
             sure &= ~(behind & far)
             told = sure & self.solid[body]
             solid[found[told & behind]] = body[told & behind]
-            asked[found[told & ((was[found] == body) | behind)]] = False
+            asked[found[told & (behind | (was[found] == body) | (was[found] == UNKNOWN))]] = False
             asked[found[~sure & self.solid[body]]] = True
         q = np.flatnonzero(asked)
         if len(q):
@@ -125,8 +125,8 @@ class Insides:
             only = {"own": self.own[q], "meets": meets & self.solid, "excluded": self.near_tets if own else None}
             tet, _ = containing_tets(self.tets, x, x[self.vertex[q]], self.vertex[q], **only)
             solid[q[tet >= 0]] = s.tet_body[tet[tet >= 0]]
-        elsewhere = (solid != NOTHING) & (was != NOTHING) & (was != solid)
-        self.inside_of[own] = np.where(elsewhere, SEVERAL, solid)
+        another = (solid != NOTHING) & (was != solid) & (was != NOTHING) & (was != UNKNOWN)
+        self.inside_of[own] = np.where(another, SEVERAL, solid)
         if own:
             through[found[behind]] = solid[found[behind]] < 0
         known[found] = below & ~far & (solid[found] == body)
