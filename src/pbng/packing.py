@@ -135,14 +135,11 @@ class Layout:
 
         ``order`` (n,) lists the vertices, and ``color`` (n,) their colours.
         """
-        by_color = np.argsort(color, kind="stable")
-        if len(self.groups.table) > 1:
-            by_color = np.lexsort((self.touched[order], color))
-        order, color = order[by_color], color[by_color]
+        touched = self.touched[order] if len(self.groups.table) > 1 else np.zeros(len(order))
+        by_color = np.lexsort((touched, color))
+        order, color, touched = order[by_color], color[by_color], touched[by_color]
         place = np.arange(len(order)) - np.searchsorted(color, color)  # within the colour
-        window = place // WINDOW
-        touched = self.touched[order] if len(self.groups.table) > 1 else window
-        order = order[np.lexsort((-self.valence[order], touched, window, color))]
+        order = order[np.lexsort((-self.valence[order], touched, place // WINDOW, color))]
         color_start = np.concatenate([[0], np.cumsum(-(-np.bincount(color) // W))])
         node = np.full(W * color_start[-1], -1)
         node[W * color_start[color] + place] = order

@@ -73,21 +73,19 @@ class BoxTree:
         expected to go relative to who asks.
         """
         x = np.ascontiguousarray(x, np.float64)
-        self._fit(self.boxes, x, x if y is None else np.ascontiguousarray(y, np.float64), margin)
+        self.margin = np.array(np.broadcast_to(np.asarray(margin, np.float64), len(x)))
+        self._fit(self.boxes, x, x if y is None else np.ascontiguousarray(y, np.float64), self.margin)
         self.way = way
         if way is not None:
             self.way = np.ascontiguousarray(way, np.float64)
-            self._fit(self.ways, self.way, self.way, 0.0)
+            self._fit(self.ways, self.way, self.way, np.zeros(len(way)))
 
-    def _fit(self, boxes: np.ndarray, x: np.ndarray, y: np.ndarray, margin: float | np.ndarray) -> None:
+    def _fit(self, boxes: np.ndarray, x: np.ndarray, y: np.ndarray, margin: np.ndarray) -> None:
         assert x.shape[1:] == y.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
         assert min(len(x), len(y)) >= self.n_vert, "a vertex has no position"
-        margin = np.array(np.broadcast_to(np.asarray(margin, np.float64), len(x)))
         numbers = np.array([self.cells.shape[1], y is not x], np.int64)
         arrays = (self.nodes, boxes, self.sorted_cells.ravel(), x, y, numbers, margin)
         run(_refit, arrays, np.arange(len(self._start) - 1)[::-1].copy(), self._start, GRAIN)
-        if boxes is self.boxes:
-            self.margin = margin
 
 
 @body

@@ -27,7 +27,7 @@ class Touches(NamedTuple):
     """Half-spaces ``{x: (x - point) · normal >= 0}`` that points have to respect at the end of a step.
 
     Attributes:
-        vertex: Which point, (j,) int64, rising; none appears twice.
+        vertex: Which point, (j,) int64; of one collider rising, and none twice.
         point: A point of the bounding plane at the end of the step [m], (j, 3): on the surface, plus the thickness.
         normal: Unit normals at the end of the step, away from the collider, (j, 3).
     """

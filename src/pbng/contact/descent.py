@@ -135,7 +135,10 @@ def find_starts(tree, meets, row, who, reach, starts, corners, stack):
 
 @inline
 def begin(moving, starts, corners, n, who, reach, stack, gaps):
-    """Put those starts on the stack that are within reach; how many."""
+    """Put those starts on the stack, in their order, that are within reach; how many.
+
+    Written out what :func:`gap2` and :func:`limit2` say, for one coordinate after the other, as vectors need it.
+    """
     low, high, w_low, w_high = who
     for s in range(n):
         dx = max(corners[s] - high[0], 0.0, low[0] - corners[3 * STARTS + s])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbng.contact.collider import dots, norms
+from pbng.contact.collider import Touches, dots, norms
 from pbng.contact.colliders import Shape
 from pbng.contact.contacts import Contacts
 from pbng.contact.halfspaces import HalfSpaces
@@ -39,9 +39,11 @@ class Detector:
         self.surfaces = SurfaceDetector(spec.surfaces, X, fixed) if spec.surfaces else None
         self.free = spec.surface[~fixed[spec.surface]]
         self.reach = self.surfaces.radius if self.surfaces else spec.margin  # farther off, directions are of no use [m]
-        self.shapes = Shapes([c for c in spec.colliders if isinstance(c, Shape)])
-        self.others = [c for c in spec.colliders if not isinstance(c, Shape)]
-        self.friction = np.array([c.friction for c in (*self.shapes.shapes, *self.others)])
+        bundled = [type(c).touch is Shape.touch for c in spec.colliders]
+        self.shapes = Shapes([c for c, b in zip(spec.colliders, bundled) if b])
+        self.bundled = np.flatnonzero(bundled)
+        self.alone = np.flatnonzero(np.logical_not(bundled))
+        self.friction = np.array([c.friction for c in spec.colliders])
         self.rubs = bool(self.friction.any())
 
     def check(self, x: np.ndarray, t: float) -> None:
@@ -81,11 +83,7 @@ class Detector:
         before, after, near = np.take(x0, self.free, 0), np.take(x1, self.free, 0), np.asarray(self.spec.margin + ahead)
         if dt is not None:
             near = CLOSE / NEAR * self.spec.margin + norms(after - before)
-        which, (touching, point, normal) = self.shapes.touch(before, after, t0, t1, near)
-        for k, c in enumerate(self.others, len(self.shapes.shapes)):
-            more = c.touch(before, after, t0, t1, near)
-            which = np.concatenate([which, np.full(len(more.vertex), k)])
-            touching, point, normal = (np.concatenate(a) for a in zip((touching, point, normal), more))
+        which, (touching, point, normal) = self._touches(before, after, t0, t1, near)
         vertex = self.free[touching].astype(np.int32)
         level = dots(normal, point)
         self._cut(x0, vertex, normal, level)
@@ -112,6 +110,19 @@ class Detector:
             return self.surfaces.find(x0, x1, dt, ahead, 0.0, k_tau)
         return self.surfaces.find(x0, x1, dt, ahead, hold, 0.0).plus(since.contacts.ties())
 
+    def _touches(
+        self, before: np.ndarray, after: np.ndarray, t0: float, t1: float, near: np.ndarray
+    ) -> tuple[np.ndarray, Touches]:
+        """Which collider each half-space is of, (j,) rising, and the half-spaces."""
+        shape, touches = self.shapes.touch(before, after, t0, t1, near)
+        which = self.bundled[shape]
+        if not len(self.alone):
+            return which, touches
+        more = [self.spec.colliders[k].touch(before, after, t0, t1, near) for k in self.alone]
+        which = np.concatenate([which, np.repeat(self.alone, [len(t.vertex) for t in more])])
+        order = np.argsort(which, kind="stable")
+        return which[order], Touches(*(np.concatenate(a)[order] for a in zip(touches, *more)))
+
     def _friction(
         self, which: np.ndarray, vertex: np.ndarray, normal: np.ndarray, borne: np.ndarray | None
     ) -> np.ndarray:
@@ -136,7 +147,7 @@ class Detector:
     def _slips(self, which: np.ndarray, points: np.ndarray, t0: float, t1: float) -> np.ndarray:
         """How far what would stick to the colliders is carried from time t0 to t1, where they rub, (k, 3) [m]."""
         slips = np.zeros((len(which), 3))
-        for k, c in enumerate((*self.shapes.shapes, *self.others)):
-            if c.friction and c.motion is not None:
+        for k, c in enumerate(self.spec.colliders):
+            if c.friction:
                 slips[which == k] = c.carried(points[which == k], t0, t1)
         return slips

@@ -72,8 +72,8 @@ class Insides:
 
         Args:
             x: Positions (n_vert, 3) [m], to which trees and normals are fitted.
-            closest: Triangle closest to each vertex, (k,) int32, its weights (k, 3) and distances (k,) [m], as
-                :func:`pbng.contact.queries.closest_triangles` finds them.
+            closest: Triangle closest to each vertex, of the own body of those that it may face, (k,) int32, its weights
+                (k, 3) and distances (k,) [m], as :func:`pbng.contact.queries.closest_triangles` finds them.
             reach: How far these were looked for [m], (k,).
             meets: Which bodies were looked at by which, (n_body, n_body) bool.
             excluded: Triangles that were left out because the vertices look at their own bodies, or None.
@@ -93,8 +93,8 @@ class Insides:
     def _solid(
         self, x: np.ndarray, triangle: np.ndarray, weights: np.ndarray, far: np.ndarray, meets: np.ndarray, own: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The solid that each vertex is inside of, -1 for none; which are also behind the plane of their triangle, and
-        of others' no triangle is closer; and which see their triangle through the own body.
+        """The solid that each vertex is inside of, -1 for none; which vertices are known to be behind the plane of
+        their triangle, with no triangle closer; and which see their triangle through the own body.
 
         What the closest point of a whole surface is tells the side. Tets are looked for where it is not known: of the
         own body a part is left out, and of triangles ``far`` out of reach only those are seen that move much. Where
@@ -129,7 +129,8 @@ class Insides:
         self.inside_of[own] = np.where(another, SEVERAL, solid)
         if own:
             through[found[behind]] = solid[found[behind]] < 0
-        known[found] = below & ~far & (solid[found] == body)
+        else:
+            known[found] = below & ~far & (solid[found] == body)
         return solid, known, through
 
     def _way_out(

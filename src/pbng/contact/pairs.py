@@ -27,10 +27,10 @@ from pbng.linalg import add, combine, cross, dot, point, scale, sub, unit
 from pbng.parallel import array, body, each, rows
 from pbng.topology import edge_sides
 
-STRAY = 0.5  # of its way may a vertex stray from where it is expected to go in a step with inertia: two, if one stops
+STRAY = 0.5  # of its way may a vertex stray in a step with inertia: if one of two that go together stops, both do
 BRISK = 0.25  # of how far is looked must vertices go for it to pay to look how they go relative to each other
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
-ASIDE = 0.5  # cosine of the angle between two parts of a solid's surface below which they may face each other
+ASIDE = 0.5  # cosine of the angle between two smooth parts of a solid's surface below which they may face each other
 ROOM = 1e-6  # of the distance that is kept, by which surfaces at rest may be too close
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
 GRAIN = 256  # pairs of edges that a thread takes at a time
@@ -58,8 +58,9 @@ class SurfaceDetector:
         tell = Sides(self.normals, start, sides)
         self.insides = Insides(s, X, self.vertex, self.body, self.triangles, self.normals, tell)
         self.solid = self.insides.solid
-        self.one_sided = bool((s.own & self.solid).any())  # what may touch itself; cloth faces both ways
         self.edges, self.beside = self._sharp_edges(edges, start, sides)
+        # Which vertices face one way: cloth faces both, and a sharp edge of a solid many.
+        self.smooth = self.solid[self.insides.own] & ~np.isin(self.vertex, self.edges)
         self.edge_ends = np.ascontiguousarray(self.edges.T)
         self.edge_body = self.body[self.edge_ends[0]]
         self.edge_tree = BoxTree(X, self.edges, self.edge_body)
@@ -148,10 +149,8 @@ class SurfaceDetector:
     def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Spans | None) -> Pairs:
         vertex, reach = self.vertex, reach[self.vertex]
         asked: dict[str, Any] = {"own": self.insides.own, "meets": meets, "vertex": vertex, "excluded": excluded}
-        if excluded is not None and self.one_sided:
-            against = self.normals.around_vertices(vertex)
-            against[~self.solid[self.insides.own]] = 0.0
-            asked |= {"against": against, "limit": ASIDE}
+        if excluded is not None and self.smooth.any():
+            asked |= {"against": self.normals.around_vertices(vertex) * self.smooth[:, None], "limit": ASIDE}
         closest = closest_triangles(self.triangles, x, x[vertex], reach, **asked)
         triangle, weights, inside = self.insides.touched(x, closest, reach, meets, excluded)
         found = np.flatnonzero(triangle >= 0)

@@ -181,7 +181,9 @@ def _common(
     listed = (
         Spans(np.zeros(1, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)) if excluded is None else excluded
     )
-    vertex = _numbers(vertex, k, NONE if excluded is None else len(listed.start) - 1)
+    assert [a.dtype for a in listed] == [np.int64, np.int32, np.int32], "spans must be of these types"
+    assert tree.way is None or len(tree.way) == len(x), "some position has no way"
+    vertex = _numbers(vertex, k, len(x) if excluded is None else len(listed.start) - 1)
     way = np.zeros((1, 3)) if tree.way is None else tree.way
     sizes = np.array([grouped, meets.shape[1], excluded is not None, tree.way is not None], np.int64)
     asked = reaches, sizes, meets, own, vertex, *listed
@@ -261,7 +263,9 @@ def _closest_triangles(arguments, low, high):
                     continue
                 t = order[e]
                 a, b, c = point(x, cells[e, 0]), point(x, cells[e, 1]), point(x, cells[e, 2])
-                n = cross(sub(b, a), sub(c, a)) if directed or behind else p
+                n = 0.0, 0.0, 0.0
+                if directed or behind:
+                    n = cross(sub(b, a), sub(c, a))
                 if directed:
                     along = dot(point(against, q), n)
                     if along > 0.0 and along * along > cosine2 * dot(n, n) * dot(point(against, q), point(against, q)):

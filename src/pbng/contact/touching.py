@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pbng.contact.collider import ON_SURFACE, Pose, Touches
+from pbng.errors import InputError
 from pbng.jit import inline
 from pbng.linalg import add, combine, dot, point, scale, sub
 from pbng.parallel import array, body, each, rows
@@ -32,9 +33,17 @@ def distances(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Signed distance (k,) [m], closest point (k, 3) and outward normal (k, 3) of a shape for points x (k, 3)."""
     x = np.ascontiguousarray(x, float)
+    _check_points(x)
     d, closest, normal = np.empty(len(x)), np.empty((len(x), 3)), np.empty((len(x), 3))
     each(_distances, (np.array([kind]), numbers, packed([pose]), x, d, closest, normal), len(x), GRAIN)
     return d, closest, normal
+
+
+def _check_points(*several: np.ndarray) -> None:
+    """InputError unless these are points, all as many."""
+    for x in several:
+        if x.shape != (len(several[0]), 3):
+            raise InputError(f"colliders: points must have shape ({len(several[0])}, 3), not {x.shape}")
 
 
 class Shapes:
@@ -53,12 +62,13 @@ class Shapes:
     def touch(
         self, before: np.ndarray, after: np.ndarray, t0: float, t1: float, reach: float | np.ndarray
     ) -> tuple[np.ndarray, Touches]:
-        """Which shape each half-space is of, (j,) rising, and the half-spaces, those of each shape by rising points."""
-        n, m = len(before), len(self.shapes)
+        """Which shape each half-space is of, (j,) rising, and the half-spaces of all shapes, one after the other."""
         poses = [s.poses(t0, t1) for s in self.shapes]
         poses = [p[:1] if p[0] is p[-1] else p for p in poses]
         first = np.array([0, *accumulate(len(p) for p in poses)])
         before, after = np.ascontiguousarray(before, float), np.ascontiguousarray(after, float)
+        _check_points(before, after)
+        n, m = len(before), len(self.shapes)
         reach = np.array(np.broadcast_to(np.asarray(reach, float), (n,)))
         chosen, where, normal = np.empty(n * m, np.bool_), np.empty((n * m, 3)), np.empty((n * m, 3))
         arrays = (
