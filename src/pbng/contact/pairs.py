@@ -167,10 +167,10 @@ class SurfaceDetector:
         """What some of the edges make pairs with."""
         asked: dict[str, Any] = {"own": self.edge_body[edges], "meets": meets, "excluded": excluded}
         one, two = self.edge_ends[:, edges]
-        other, s, t = np.full(len(self.edges), -1, np.int32), np.empty(len(self.edges)), np.empty(len(self.edges))
-        other[edges], s[edges], t[edges], _ = closest_edges(
-            self.edge_tree, x, self.edges[edges], np.maximum(reach[one], reach[two]), **asked
-        )
+        reaches = np.maximum(reach[one], reach[two])
+        other, s, t, _ = closest_edges(self.edge_tree, x, self.edges[edges], reaches, **asked)
+        if len(other) < len(self.edges):
+            other, s, t = (_spread(a, edges, len(self.edges)) for a in (other, s, t))
         mine = np.flatnonzero(other >= 0)
         m = len(mine)
         stencil, weights, outward = np.empty((m, 4), np.int32), np.empty((m, 4)), np.empty((m, 3))
@@ -203,6 +203,13 @@ class SurfaceDetector:
                     f"contact: body {names[b]!r} starts fully inside body {names[solid]!r} ({len(mine)} vertices);"
                     " move one of them"
                 )
+
+
+def _spread(a: np.ndarray, at: Any, n: int) -> np.ndarray:
+    """Numbers as those ``at`` some places of n, -1 elsewhere."""
+    out = np.full(n, -1, a.dtype)
+    out[at] = a
+    return out
 
 
 @body

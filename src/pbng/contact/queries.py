@@ -170,18 +170,20 @@ def _common(
     x = np.ascontiguousarray(x, np.float64)
     assert x.shape[1:] == (3,), "positions must have shape (n_vert, 3)"
     assert len(x) >= tree.n_vert, "a vertex has no position"
-    reaches = np.array(np.broadcast_to(np.asarray(reach, np.float64), (k,)))
+    reaches = np.full(k, reach, np.float64)
     assert (own is None) == (meets is None), "own and meets go together"
     grouped = own is not None
     meets = np.ones((1, tree.n_group), bool) if meets is None else np.ascontiguousarray(meets, np.bool_)
     assert meets.shape[1] >= tree.n_group, "meets has no column for some group of the tree"
     own = _numbers(own, k, len(meets))
     if grouped:
-        reaches[~np.any(meets, axis=1)[own]] = -1.0
+        asks = np.any(meets, axis=1)
+        if not np.all(asks):
+            reaches[~asks[own]] = -1.0
     listed = (
         Spans(np.zeros(1, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)) if excluded is None else excluded
     )
-    assert [a.dtype for a in listed] == [np.int64, np.int32, np.int32], "spans must be of these types"
+    assert listed.start.dtype == np.int64, "spans begin at numbers of 64 bits"
     assert tree.way is None or len(tree.way) == len(x), "some position has no way"
     vertex = _numbers(vertex, k, len(x) if excluded is None else len(listed.start) - 1)
     way = np.zeros((1, 3)) if tree.way is None else tree.way
