@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import pbng
+import pbng.gallery
 from pbng.contact.detection import Detector
+from pbng.contact.quiet import Quiet
 from pbng.motions import Translate
 
 CLOTH = pbng.Membrane(E=100.0, nu=0.3, density=0.1)
@@ -88,6 +90,37 @@ def test_what_is_inside_its_own_body_leaves_by_the_closest_way():
         mine = np.isin(found.vertices[:, 0], top) & (found.weights[:, 0] == 1)
         assert mine.sum() == len(top)
         np.testing.assert_allclose(found.normal[mine], [[0.0, 1.0, 0.0]] * len(top), atol=1e-9)
+
+
+def test_quiet_cloth_finds_what_it_would_find_if_all_asked(monkeypatch):
+    """Who is known to be alone need not ask; where vertices go too far, or one looks farther, nothing is known."""
+    recipe = pbng.gallery.cloth_on_sphere(resolution=16)
+    asked, last = [], []
+    alone = Quiet.alone
+
+    def noted(self, x, way, radius):
+        known = alone(self, x, way, radius)
+        asked.append(len(x) - (0 if known is None else len(known)))
+        return known
+
+    monkeypatch.setattr(Quiet, "alone", noted)
+    for never in (False, True):
+        if never:
+            monkeypatch.setattr(Quiet, "pays", lambda self: False)
+        frames = pbng.simulate(recipe.scene, budget=recipe.budget, inertia=True, substeps=8, frames=60, fps=recipe.fps)
+        last.append([f.x for f in frames][-1])
+        if not never:
+            assert np.mean(np.array(asked[200:]) < 100) > 0.5  # of 256
+    assert np.array_equal(*last)
+
+    quiet, x, room = Quiet(), np.zeros((4, 3)), np.full(4, 1.0)
+    quiet.note(x, room, 0.5, np.array([2]))
+    assert quiet.alone(x, np.full(4, 0.9), 0.5).tolist() == [2]
+    assert quiet.alone(x, np.full(4, 0.9), 0.6) is None
+    assert quiet.alone(x + 0.2, np.full(4, 0.9), 0.5) is None
+    assert quiet.alone(x + np.nan, np.full(4, 0.1), 0.5) is None
+    quiet.forget()
+    assert quiet.alone(x, room, 0.0) is None
 
 
 class Sieve(pbng.Plane):

@@ -17,6 +17,7 @@ from pbng.contact.contacts import Contacts
 from pbng.contact.inside import Insides
 from pbng.contact.normals import SHARP, SmoothNormals
 from pbng.contact.queries import closest_edges, closest_triangles
+from pbng.contact.quiet import Quiet
 from pbng.contact.resistance import Pairs, resist
 from pbng.contact.rings import Spans, neighbourhoods, spans
 from pbng.contact.sides import Sides
@@ -29,11 +30,13 @@ from pbng.topology import edge_sides
 
 STRAY = 0.5  # of its way may a vertex stray in a step with inertia: if one of two that go together stops, both do
 BRISK = 0.25  # of how far is looked must vertices go for it to pay to look how they go relative to each other
+LULL, REST = 2.5, 0.25  # of what it may go in a step, and of how far it looks, may cloth go before all ask again
 AHEAD = 4.0  # radii at most from which on surfaces count as close: farther apart, directions soon mean nothing
 ASIDE = 0.5  # cosine of the angle between two smooth parts of a solid's surface below which they may face each other
 ROOM = 1e-6  # of the distance that is kept, by which surfaces at rest may be too close
 SIDE = 1e-6  # weights of an edge's ends from which on a contact is with a vertex
 GRAIN = 256  # pairs of edges that a thread takes at a time
+NONE = Pairs(np.empty((0, 4), np.int32), np.empty((0, 4)), np.empty((0, 3)), np.empty(0, bool))
 
 
 class SurfaceDetector:
@@ -77,6 +80,7 @@ class SurfaceDetector:
         if self.any_own:
             self._check_room(X)
             self.insides.forget()
+        self.own_sheets, self.quiet = self.any_own and not (s.own & self.solid).any(), Quiet()
 
     def _check_room(self, X: np.ndarray) -> None:
         """InputError if what may touch itself is closer at rest than the distance that is kept: it would swell."""
@@ -126,12 +130,15 @@ class SurfaceDetector:
             margin, way = (STRAY * margin, x1 - x0) if brisk else ((1 + STRAY) * margin, None)
         reach = radius + margin
         self.normals.fit(x0)
+        alone = self._alone(x0, radius, margin) if self.own_sheets and way is None else self.vertex[:0]
         self.triangles.refit(x0, margin=margin, way=way)
-        pairs, own_edges = [], np.empty(0, np.int64)
+        pairs, own_edges = [NONE], np.empty(0, np.int64)
         if self.several:
             pairs.append(self._vertex_triangle(x0, reach, self.meets_others, None))
-        if self.any_own:
-            pairs.append(self._vertex_triangle(x0, reach, self.meets_itself, self.near_triangles))
+        if self.any_own and len(alone) < len(self.vertex):
+            near = reach.copy()
+            near[alone] = -1.0
+            pairs.append(self._vertex_triangle(x0, near, self.meets_itself, self.near_triangles))
             seen = np.zeros(len(x0), bool)  # where a surface comes near itself, vertices tell
             seen[pairs[-1].vertices] = True
             own_edges = np.flatnonzero(seen[self.edge_ends[0]] | seen[self.edge_ends[1]])
@@ -145,6 +152,22 @@ class SurfaceDetector:
         if self.any_fixed:
             found = found.some(~self.fixed[found.vertices].all(1))
         return resist(found, x0, self.body, s, self.radius, dt, hold, k_tau)
+
+    def _alone(self, x: np.ndarray, radius: float, margin: np.ndarray) -> np.ndarray:
+        """Vertices (k,) of cloth that are known to be away from all that they could touch of it: they need not ask.
+
+        They are asked once for several steps: within ``radius`` [m], and as far as all may go in these; ``margin``
+        (n_vert,) [m] is how far they may go in one.
+        """
+        alone = self.quiet.alone(x, margin, radius)
+        if alone is None and self.quiet.pays():
+            room = LULL * margin + REST * radius
+            self.triangles.refit(x, margin=room)
+            asked: dict[str, Any] = {"own": self.insides.own, "meets": self.meets_itself, "vertex": self.vertex}
+            asked["excluded"] = self.near_triangles
+            found, *_ = closest_triangles(self.triangles, x, x[self.vertex], radius + room[self.vertex], **asked)
+            alone = self.quiet.note(x, room, radius, self.vertex[found < 0])
+        return self.vertex[:0] if alone is None else alone
 
     def _vertex_triangle(self, x: np.ndarray, reach: np.ndarray, meets: np.ndarray, excluded: Spans | None) -> Pairs:
         vertex, reach = self.vertex, reach[self.vertex]
@@ -183,7 +206,8 @@ class SurfaceDetector:
         return Pairs(stencil, weights, outward, inside).some(used)
 
     def check(self, x: np.ndarray) -> None:
-        """InputError if a body lies wholly inside another at x: no way out is then the shortest."""
+        """InputError if a body lies wholly inside another at x, where all begins: no way out is then the shortest."""
+        self.quiet.forget()
         if not self.solid.any() or not self.several:
             return
         x = np.ascontiguousarray(x, float)
