@@ -41,9 +41,9 @@ def distances(
 
 def _check_points(*several: np.ndarray) -> None:
     """InputError unless these are points, all as many."""
-    for x in several:
-        if x.shape != (len(several[0]), 3):
-            raise InputError(f"colliders: points must have shape ({len(several[0])}, 3), not {x.shape}")
+    shapes = [x.shape for x in several]
+    if any(len(shape) != 2 or shape[1] != 3 for shape in shapes) or len(set(shapes)) > 1:
+        raise InputError(f"colliders: points must have shape (k, 3), not {' and '.join(map(str, shapes))}")
 
 
 class Shapes:
