@@ -70,3 +70,28 @@ def test_what_comes_near_in_one_step_takes_nothing_along(by):
     assert result.status is pbng.Status.CONVERGED
     np.testing.assert_allclose(result.x[: plate.start], scene.compile().X[: plate.start], atol=1e-6)
     assert result.x[plate.start :, 1].min() == pytest.approx(2 - by, abs=1e-3)
+
+
+def test_the_outside_of_what_is_far_and_fast_tells_nothing():
+    """What is deep in a torso sees of it, for a step, only an arm that comes near: it stays inside."""
+    torso, arm = (
+        pbng.shapes.box((1.0, 1.0, 1.0), 4),
+        pbng.shapes.box((0.2, 1.0, 1.0), (2, 4, 4), origin=(1.2, 0.0, 0.0)),
+    )
+    both = pbng.TetMesh(np.concatenate([torso.X, arm.X]), np.concatenate([torso.cells, torso.n_vert + arm.cells]))
+    scene = pbng.Scene()
+    scene.add(both, SOFT, name="body")
+    rod = scene.add(pbng.shapes.box((0.2, 1.0, 0.2), (3, 6, 3)), SOFT, name="rod", at=(0.4, 0.5, 0.4))
+    scene.contact()
+    problem = scene.compile(free=True)
+    detector = Detector(problem.contact, problem.X, problem.fixed)
+    x, ins = problem.X, detector.surfaces.insides
+    ahead = x.copy()
+    ahead[torso.n_vert : rod.start][np.isclose(arm.X[:, 0], 1.2), 0] -= 0.6
+    inside_of = []
+    for to in (x, ahead, x):
+        detector.find(x, to, 0.0, 0.01, dt=0.01)
+        inside_of.append(ins.inside_of[0] != NOTHING)
+    assert inside_of[0].sum() > 5
+    for later in inside_of[1:]:
+        assert np.array_equal(later, inside_of[0])

@@ -117,7 +117,8 @@ class Insides:
             sure &= ~(behind & far)
             told = sure & self.solid[body]
             solid[found[told & behind]] = body[told & behind]
-            asked[found[told & (behind | (was[found] == body) | (was[found] == UNKNOWN))]] = False
+            left = (was[found] == UNKNOWN) | ((was[found] == body) & ~far)
+            asked[found[told & (behind | left)]] = False
             asked[found[~sure & self.solid[body]]] = True
         q = np.flatnonzero(asked)
         if len(q):

@@ -208,6 +208,7 @@ class SurfaceDetector:
     def check(self, x: np.ndarray) -> None:
         """InputError if a body lies wholly inside another at x, where all begins: no way out is then the shortest."""
         self.quiet.forget()
+        self.insides.forget()
         if not self.solid.any() or not self.several:
             return
         x = np.ascontiguousarray(x, float)

@@ -114,7 +114,8 @@ def closest_edges(
     edges = np.ascontiguousarray(edges, np.int32).reshape(-1, 2)
     k = len(edges)
     assert edges.min(initial=0) >= 0, "an edge has no vertex"
-    assert edges.max(initial=-1) < len(x), "a vertex has no position"
+    end = len(x) if excluded is None else min(len(x), len(excluded.start) - 1)
+    assert edges.max(initial=-1) < end, "a vertex has no position, or no list of what it excludes"
     found, s, t, distance = np.empty(k, np.int32), np.empty(k), np.empty(k), np.empty(k)
     common = _common(tree, 2, x, k, reach, own, meets, None, excluded)
     each(_closest_edges, (*common, edges, found, s, t, distance), k, GRAIN)
@@ -185,7 +186,7 @@ def _common(
     )
     assert listed.start.dtype == np.int64, "spans begin at numbers of 64 bits"
     assert tree.way is None or len(tree.way) == len(x), "some position has no way"
-    vertex = _numbers(vertex, k, len(x) if excluded is None else len(listed.start) - 1)
+    vertex = _numbers(vertex, k, len(x) if excluded is None else min(len(x), len(listed.start) - 1))
     way = np.zeros((1, 3)) if tree.way is None else tree.way
     sizes = np.array([grouped, meets.shape[1], excluded is not None, tree.way is not None], np.int64)
     asked = reaches, sizes, meets, own, vertex, *listed

@@ -4,7 +4,7 @@ import numpy as np
 
 from pbng.contact.collider import norms
 
-SERVED, PAUSE = 2, 8  # steps that it has to have lasted to be found out again at once, and how many go by otherwise
+SERVED, PAUSE = 2, 8  # steps that it has to have lasted to be found out again at once, and every how many otherwise
 
 
 class Quiet:
