@@ -73,7 +73,7 @@ class BoxTree:
         expected to go relative to who asks.
         """
         x = np.ascontiguousarray(x, np.float64)
-        self.margin = np.array(np.broadcast_to(np.asarray(margin, np.float64), len(x)))
+        self.margin = np.full(len(x), margin, np.float64)
         self._fit(self.boxes, x, x if y is None else np.ascontiguousarray(y, np.float64), self.margin)
         self.way = way
         if way is not None:

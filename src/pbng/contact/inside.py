@@ -55,8 +55,10 @@ class Insides:
         self.inside_of = [np.full(len(self.vertex), UNKNOWN) for _ in range(2)]
 
     def solids(self, x: np.ndarray, meets: np.ndarray) -> np.ndarray:
-        """The solid of others, by ``meets``, whose tets each vertex is in at x (n_vert, 3) [m], (k,); -1 for none."""
-        self.forget()
+        """The solid of others, by ``meets``, whose tets each vertex is in at x (n_vert, 3) [m], (k,); -1 for none.
+
+        All are looked for: nothing may be known of them yet.
+        """
         nothing = np.full(len(self.vertex), -1, np.int32)
         return self._solid(x, nothing, np.zeros((len(nothing), 3)), nothing > 0, meets, own=False)[0]
 

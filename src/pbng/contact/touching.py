@@ -69,7 +69,7 @@ class Shapes:
         before, after = np.ascontiguousarray(before, float), np.ascontiguousarray(after, float)
         _check_points(before, after)
         n, m = len(before), len(self.shapes)
-        reach = np.array(np.broadcast_to(np.asarray(reach, float), (n,)))
+        reach = np.full(n, reach, float)
         chosen, where, normal = np.empty(n * m, np.bool_), np.empty((n * m, 3)), np.empty((n * m, 3))
         arrays = (
             np.array([n]), self.kind, self.numbers, self.thickness, first, packed([p for s in poses for p in s]),
